@@ -15,15 +15,17 @@ use crate::people::{self, account};
 pub const SIGHTS: &[&str] = &["--node", "sights.py"];
 
 /// A daemon with tokens, `sights_py`, and a robot `rover` at work there.
-struct Scene {
-    daemon: Daemon,
+pub struct Scene {
+    pub daemon: Daemon,
     admin: String,
-    rover: Robot,
-    servant: String,
+    pub rover: Robot,
+    /// The robot's.
+    pub token: String,
+    pub servant: String,
 }
 
 impl Scene {
-    fn new(name: &str, config: &str) -> anyhow::Result<Scene> {
+    pub fn new(name: &str, config: &str) -> anyhow::Result<Scene> {
         let daemon = world().own(name).config(config).start()?;
         let admin = token(&daemon, &["chief", "--role", "admin"])?;
         daemon.deployer().pushes("sights_py", SIGHTS)?.succeeded()?;
@@ -47,11 +49,12 @@ impl Scene {
             daemon,
             admin,
             rover,
+            token: own,
             servant,
         })
     }
 
-    fn viewer(&self, name: &str, services: &str) -> anyhow::Result<String> {
+    pub fn viewer(&self, name: &str, services: &str) -> anyhow::Result<String> {
         let given = [name, "--role", "viewer", "--service", services];
         token(&self.daemon, &given)
     }
@@ -67,12 +70,12 @@ impl Scene {
         Robot::try_connect(&url)
     }
 
-    fn told(&self) -> anyhow::Result<Value> {
+    pub fn told(&self) -> anyhow::Result<Value> {
         self.daemon
             .api(&format!("/api/v1/servants/{}", self.servant))
     }
 
-    fn audited(&self, who: &str, did: &str) -> Verdict {
+    pub fn audited(&self, who: &str, did: &str) -> Verdict {
         support::until(&format!("a record that {who} {did}"), || {
             let typed = ["--format", "json", "audit", "-n", "1000"];
             let log = self.daemon.deployer().types(&typed)?.succeeded()?.stdout;
@@ -88,7 +91,7 @@ impl Scene {
     }
 }
 
-fn refused(connection: Result<Robot, Refusal>, status: u16, words: &str) -> Verdict {
+pub fn refused(connection: Result<Robot, Refusal>, status: u16, words: &str) -> Verdict {
     match connection {
         Ok(_) => bail!("let in, and not refused with {status} {words}"),
         Err(refusal) => {
@@ -102,7 +105,7 @@ fn refused(connection: Result<Robot, Refusal>, status: u16, words: &str) -> Verd
 }
 
 /// Waits for a picture in binary, which is as large as it was published.
-fn hears_a_picture(robot: &mut Robot) -> Verdict {
+pub fn hears_a_picture(robot: &mut Robot) -> Verdict {
     loop {
         if let Message::Binary(bytes) = robot.frame(PATIENCE)? {
             ensure!(bytes.len() > 640 * 480 * 3, "{} bytes", bytes.len());
@@ -350,7 +353,7 @@ pub fn who_looks_slowly_costs_its_robot_nothing() -> Verdict {
         .daemon
         .url(&format!("{}?token={eve}", scene.address()));
     // She asks for thirty pictures a second, and takes none of them.
-    let mut slow = Robot::on_a_short_line(&url)?;
+    let mut slow = Robot::on_a_short_line(&url, &[])?;
     slow.says(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor"}))?;
     let publish = |op: &str| json!({"op": op, "topic": "/sights/say", "type": "std_msgs/String"});
     scene.rover.says(publish("advertise"))?;

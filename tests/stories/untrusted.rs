@@ -158,7 +158,7 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     const SIZE: usize = 900_000;
     let daemon = world().with(GREETER)?;
     let mut speaker = daemon.robot("greeter_cpp?robot=backlog")?;
-    let mut slow = Robot::on_a_short_line(&daemon.url("greeter_cpp?robot=backlog"))?;
+    let mut slow = Robot::on_a_short_line(&daemon.url("greeter_cpp?robot=backlog"), &[])?;
     let topic = json!({"op": "subscribe", "topic": "/big", "type": "std_msgs/String", "compression": "cbor-raw"});
     slow.says(topic)?;
     slow.calls("/rosapi/get_time", json!({}))?;

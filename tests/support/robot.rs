@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
+use tokio_tungstenite::tungstenite::http::Uri;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::{self, ClientRequestBuilder, Message, WebSocket};
 
@@ -19,6 +20,13 @@ pub struct Robot {
     calls: u64,
 }
 
+fn offering(uri: Uri, protocols: &[&str]) -> ClientRequestBuilder {
+    let request = ClientRequestBuilder::new(uri);
+    protocols.iter().fold(request, |request, protocol| {
+        request.with_sub_protocol(*protocol)
+    })
+}
+
 impl Robot {
     /// Connects to `ws://ADDRESS/PATH`.
     pub fn connect(url: &str) -> anyhow::Result<Robot> {
@@ -26,15 +34,16 @@ impl Robot {
     }
 
     /// Connects with a socket of its own side that takes little before it is read.
-    pub fn on_a_short_line(url: &str) -> anyhow::Result<Robot> {
+    pub fn on_a_short_line(url: &str, protocols: &[&str]) -> anyhow::Result<Robot> {
         let address = url
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
             .context("a ws:// address")?;
         let stream = TcpStream::connect(address)?;
         nix::sys::socket::setsockopt(&stream, nix::sys::socket::sockopt::RcvBuf, &(64 * 1024))?;
-        let (socket, _) =
-            tungstenite::client(url, stream).map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
+        let request = offering(url.parse()?, protocols);
+        let (socket, _) = tungstenite::client(request, stream)
+            .map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
         Ok(Robot {
             socket,
             backlog: VecDeque::new(),
@@ -75,11 +84,7 @@ impl Robot {
         let uri = url
             .parse()
             .map_err(|error| Refusal::other(&format!("{error}")))?;
-        let request = protocols
-            .iter()
-            .fold(ClientRequestBuilder::new(uri), |request, protocol| {
-                request.with_sub_protocol(*protocol)
-            });
+        let request = offering(uri, protocols);
         let request = headers.iter().fold(request, |request, (name, value)| {
             request.with_header(*name, *value)
         });

@@ -127,7 +127,7 @@ pub(crate) fn unread(daemon: &Daemon) -> Result<String> {
     let url = daemon.url("adder_py?robot=victim");
     let mut slow = Vec::new();
     for _ in 0..READERS {
-        let mut robot = Robot::on_a_short_line(&url)?;
+        let mut robot = Robot::on_a_short_line(&url, &[])?;
         robot.subscribes("/unread")?;
         robot.calls("/rosapi/get_time", json!({}))?;
         slow.push(robot);

@@ -64,7 +64,7 @@ impl Granted {
     }
 
     /// What is granted now.
-    pub(crate) fn grants(&self) -> Arc<Grants> {
+    pub fn grants(&self) -> Arc<Grants> {
         match &*self.standing.borrow() {
             Standing::Granted(grants) => Arc::clone(grants),
             Standing::Ended(_) => Arc::default(),
@@ -72,7 +72,7 @@ impl Granted {
     }
 
     /// Refuses, in words, what is not granted.
-    pub(crate) fn check(&self, operation: Operation, name: &str) -> Result<(), String> {
+    pub fn check(&self, operation: Operation, name: &str) -> Result<(), String> {
         let grants = self.grants();
         let asked = || format!("{}:{name}", operation.name());
         if grants.permits(operation, name) {
@@ -93,7 +93,7 @@ impl Granted {
     }
 
     /// Why the connection is to end, if it is.
-    pub(crate) fn ended(&self) -> Option<String> {
+    pub fn ended(&self) -> Option<String> {
         match &*self.standing.borrow() {
             Standing::Granted(_) => None,
             Standing::Ended(reason) => Some(reason.clone()),
@@ -101,7 +101,7 @@ impl Granted {
     }
 
     /// Comes back when it has changed since this was made or last asked; never, where nobody can change it.
-    pub(crate) async fn changed(&mut self) {
+    pub async fn changed(&mut self) {
         if self.standing.changed().await.is_err() {
             std::future::pending().await
         }

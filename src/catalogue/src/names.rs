@@ -2,7 +2,9 @@
 //! container names) and to robots.
 
 /// First path segments that the portal keeps for itself.
-pub const RESERVED: [&str; 6] = ["api", "v2", "stubs", "metrics", "healthz", "assets"];
+pub const RESERVED: [&str; 7] = [
+    "api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove",
+];
 
 /// A name that cannot be given.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]

@@ -13,6 +13,8 @@ use futures_util::{Stream, StreamExt};
 use http_body_util::combinators::UnsyncBoxBody;
 use http_body_util::{BodyExt, Full};
 use hyper::body::Incoming;
+use hyper::header::HeaderValue;
+use hyper::upgrade::Upgraded;
 use hyper::{Method, Request, Response, StatusCode, header};
 use hyper_util::rt::TokioIo;
 use serde::Serialize;
@@ -22,6 +24,10 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 use tokio_rustls::client::TlsStream;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::handshake::client::generate_key;
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
 const FALLBACK: &str = "127.0.0.1:9090";
 /// How long a server may take to accept a connection, and then to show its certificate.
@@ -33,6 +39,11 @@ const TOKEN_WANTED: &str = "give a token that an admin made for you with --token
 
 /// Where no authority is known.
 const NOBODY_TRUSTED: &str = "no authority is trusted here, and the server's certificate does not sign itself: apt install ca-certificates";
+
+const NAME: &str = concat!("cloudroidctl/", env!("CARGO_PKG_VERSION"));
+
+/// A WebSocket to the daemon.
+pub type Socket = WebSocketStream<TokioIo<Upgraded>>;
 
 /// What is sent.
 pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
@@ -246,6 +257,37 @@ impl Client {
         path: &str,
         body: Body,
     ) -> anyhow::Result<Response<Incoming>> {
+        let request = Request::builder().method(method).uri(path);
+        self.ask(request.body(body)?).await
+    }
+
+    /// Becomes a WebSocket of this subprotocol (RFC 6455, section 4.1).
+    pub async fn socket(&self, path: &str, protocol: &str) -> anyhow::Result<Socket> {
+        let key = generate_key();
+        let request = Request::builder()
+            .uri(path)
+            .header(header::CONNECTION, "Upgrade")
+            .header(header::UPGRADE, "websocket")
+            .header(header::SEC_WEBSOCKET_VERSION, "13")
+            .header(header::SEC_WEBSOCKET_KEY, &key)
+            .header(header::SEC_WEBSOCKET_PROTOCOL, protocol);
+        let response = self.ask(request.body(empty())?).await?;
+        let accepted = response.headers().get(header::SEC_WEBSOCKET_ACCEPT);
+        let accepted = accepted.is_some_and(|accept| *accept == derive_accept_key(key.as_bytes()));
+        if response.status() != StatusCode::SWITCHING_PROTOCOLS || !accepted {
+            bail!("what answers at {} speaks no WebSocket", self.server);
+        }
+        let upgraded = hyper::upgrade::on(response).await.with_context(|| Lost {
+            server: self.server.clone(),
+        })?;
+        let config = WebSocketConfig::default()
+            .max_message_size(None)
+            .max_frame_size(None);
+        let io = TokioIo::new(upgraded);
+        Ok(WebSocketStream::from_raw_socket(io, Role::Client, Some(config)).await)
+    }
+
+    async fn ask(&self, request: Request<Body>) -> anyhow::Result<Response<Incoming>> {
         let unreachable = |source| Unreachable {
             server: self.server.clone(),
             source,
@@ -253,16 +295,16 @@ impl Client {
         match &self.server {
             Server::Tcp(authority) => {
                 let stream = dial(authority).await.map_err(unreachable)?;
-                self.exchange(stream, authority, method, path, body).await
+                self.exchange(stream, authority, request).await
             }
             Server::Tls(authority) => {
                 let stream = dial(authority).await.map_err(unreachable)?;
                 let stream = self.secured(stream, authority).await?;
-                self.exchange(stream, authority, method, path, body).await
+                self.exchange(stream, authority, request).await
             }
             Server::Unix(socket) => {
                 let stream = connect(socket).await.map_err(unreachable)?;
-                self.exchange(stream, "localhost", method, path, body).await
+                self.exchange(stream, "localhost", request).await
             }
         }
     }
@@ -300,9 +342,7 @@ impl Client {
         &self,
         stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
         host: &str,
-        method: Method,
-        path: &str,
-        body: Body,
+        mut request: Request<Body>,
     ) -> anyhow::Result<Response<Incoming>> {
         let lost = || Lost {
             server: self.server.clone(),
@@ -310,23 +350,17 @@ impl Client {
         let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
             .await
             .with_context(lost)?;
-        tokio::spawn(connection);
-        let mut request = Request::builder()
-            .method(&method)
-            .uri(path)
-            .header(header::HOST, host)
-            .header(
-                header::USER_AGENT,
-                concat!("cloudroidctl/", env!("CARGO_PKG_VERSION")),
-            );
+        tokio::spawn(connection.with_upgrades());
+        let headers = request.headers_mut();
+        headers.insert(header::HOST, HeaderValue::from_str(host)?);
+        headers.insert(header::USER_AGENT, HeaderValue::from_static(NAME));
         if let Some(token) = &self.token {
-            request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
+            let token = HeaderValue::from_str(&format!("Bearer {token}"))?;
+            headers.insert(header::AUTHORIZATION, token);
         }
-        let response = sender
-            .send_request(request.body(body)?)
-            .await
-            .with_context(lost)?;
-        if response.status().is_success() {
+        let response = sender.send_request(request).await.with_context(lost)?;
+        let status = response.status();
+        if status.is_success() || status == StatusCode::SWITCHING_PROTOCOLS {
             return Ok(response);
         }
         Err(refusal(response).await)

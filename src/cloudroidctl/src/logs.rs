@@ -1,10 +1,10 @@
 //! `logs`: what nodes print.
 
-use anyhow::bail;
-use api::{LogLine, Servant};
+use api::LogLine;
 use futures_util::StreamExt;
 
 use crate::client::{Client, escaped};
+use crate::inside;
 use crate::output::{self, Format};
 
 /// Print what a servant's nodes have printed.
@@ -23,7 +23,7 @@ pub struct Logs {
 impl Logs {
     /// Asks and prints.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let servant = self.find(client).await?;
+        let servant = inside::servant(client, &self.servant).await?;
         let tail = self
             .tail
             .map(|lines| format!("&tail={lines}"))
@@ -49,30 +49,5 @@ impl Logs {
             }
         }
         Ok(())
-    }
-
-    async fn find(&self, client: &Client) -> anyhow::Result<String> {
-        let servants: Vec<Servant> = client.get("/api/v1/servants").await?;
-        if servants.iter().any(|servant| servant.id == self.servant) {
-            return Ok(self.servant.clone());
-        }
-        let named: Vec<&Servant> = servants
-            .iter()
-            .filter(|servant| servant.service == self.servant)
-            .collect();
-        match named.as_slice() {
-            [only] => Ok(only.id.clone()),
-            // The daemon says what exists.
-            [] => Ok(self.servant.clone()),
-            several => {
-                let ids: Vec<&str> = several.iter().map(|servant| servant.id.as_str()).collect();
-                bail!(
-                    "{} has {} servants; name one: {}",
-                    self.servant,
-                    ids.len(),
-                    ids.join(", ")
-                )
-            }
-        }
     }
 }

@@ -14,6 +14,7 @@ mod exit;
 mod explain;
 mod export;
 mod fit;
+mod inside;
 mod limits;
 mod logs;
 mod manual;
@@ -21,6 +22,9 @@ mod output;
 mod pair;
 mod policy;
 mod push;
+mod record;
+mod recording;
+mod replay;
 mod rm;
 mod rollback;
 mod rollout;
@@ -87,6 +91,8 @@ enum Verb {
     Servants(servants::Servants),
     Top(top::Top),
     Logs(logs::Logs),
+    Record(record::Record),
+    Replay(replay::Replay),
     Events(events::Events),
     Set(set::Set),
     Shadow(shadow::Shadow),
@@ -155,6 +161,8 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Servants(verb) => verb.run(&client, format).await,
         Verb::Top(verb) => verb.run(&client, format).await,
         Verb::Logs(verb) => verb.run(&client, format).await,
+        Verb::Record(verb) => verb.run(&client, format).await,
+        Verb::Replay(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
         Verb::Set(verb) => verb.run(&client, format).await,
         Verb::Shadow(verb) => verb.run(&client, format).await,

@@ -16,8 +16,10 @@ use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::Response;
 use bridge::{Granted, SessionOptions, Waiting};
+use budget::Budget;
+use bytes::Bytes;
 use choreographer::Handle;
-use hyper::upgrade::OnUpgrade;
+use hyper::upgrade::{OnUpgrade, Upgraded};
 use parking_lot::Mutex;
 use reach::Reach;
 use tokio::sync::watch;
@@ -41,7 +43,7 @@ pub struct Lookers {
 
 /// One connection of those that a servant may have.
 #[derive(Debug)]
-struct Place {
+pub struct Place {
     all: Arc<Mutex<HashMap<String, Vec<String>>>>,
     servant: String,
     who: String,
@@ -126,85 +128,136 @@ fn is_free(app: &App, caller: &Caller, robot: &str) -> Result<bool, Error> {
     Ok(owner.is_none() || owner == caller.who.owner)
 }
 
+/// Somebody who looks into a servant, once the connection is a WebSocket.
+pub struct Looker {
+    pub handle: Arc<Handle>,
+    pub reach: Arc<dyn Reach>,
+    /// What all its connections may hold.
+    pub budget: Budget,
+    /// What it may, as it changes.
+    pub granted: Granted,
+    pub caller: Caller,
+}
+
+/// A servant that the caller may look into, and what the caller may do there.
+pub struct Door {
+    app: Arc<App>,
+    handle: Arc<Handle>,
+    caller: Caller,
+    part: Part,
+}
+
+impl Door {
+    /// Of the servant of this id.
+    pub fn of(app: &Arc<App>, id: &str, caller: Caller) -> Result<Self, Error> {
+        let handle = app.choreographer.servant(id)?;
+        let part = part(app, &caller, &handle)?;
+        Ok(Self {
+            app: Arc::clone(app),
+            handle,
+            caller,
+            part,
+        })
+    }
+
+    /// Becomes a WebSocket of this subprotocol, at which `serve` speaks for as long as the caller may look inside.
+    pub fn open<Served: Future<Output = ()> + Send>(
+        self,
+        mut request: Request,
+        protocol: Option<&'static str>,
+        serve: impl FnOnce(Looker, reach::Stream, Bytes) -> Served + Send + 'static,
+    ) -> Result<Response, Error> {
+        let accept = handshake::accept(&request)?;
+        let id = &self.handle.id;
+        let Some(reach) = self.handle.reach() else {
+            return Err(Error::NotThereYet(id.clone()));
+        };
+        let place = self.app.inside.place(id, &self.caller.who.principal.name)?;
+        let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
+            return Err(Error::BadRequest(
+                "this connection cannot become a WebSocket".to_owned(),
+            ));
+        };
+        notes(&self.app, &self.caller, &self.handle)("looks inside");
+        let sessions = self.app.sessions.clone();
+        sessions.spawn(async move {
+            match upgrade.await {
+                Ok(upgraded) => self.session(upgraded, reach, serve).await,
+                Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
+            }
+            drop(place);
+        });
+        let mut response = Response::new(Body::empty());
+        *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+        let headers = response.headers_mut();
+        headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
+        headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+        headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+        if let Some(protocol) = protocol {
+            let protocol = HeaderValue::from_static(protocol);
+            headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
+        }
+        Ok(response)
+    }
+
+    async fn session<Served: Future<Output = ()>>(
+        self,
+        upgraded: Upgraded,
+        reach: Arc<dyn Reach>,
+        serve: impl FnOnce(Looker, reach::Stream, Bytes) -> Served,
+    ) {
+        let Self {
+            app,
+            handle,
+            caller,
+            part,
+        } = self;
+        let (io, read_ahead) = robots::unwrapped(upgraded);
+        let memory = app.choreographer.memory();
+        let service = handle.service().to_owned();
+        let (standing, granted) =
+            watch::channel(app.principals.standing_inside(&caller.who, &service, part));
+        let refused = notes(&app, &caller, &handle);
+        let used = notes(&app, &caller, &handle);
+        let looker = Looker {
+            handle,
+            reach,
+            budget: memory.client(&caller.peer.client(None)),
+            granted: Granted::by(granted)
+                .telling(move |operation| refused(&format!("was refused {operation}")))
+                .noting(move |operation| used(&format!("inside: {operation}"))),
+            caller: caller.clone(),
+        };
+        tokio::select! {
+            () = serve(looker, io, read_ahead) => {}
+            () = app.principals.follow_inside(&caller.who, &service, part, &standing) => {}
+        }
+    }
+}
+
 /// Becomes a WebSocket that speaks rosbridge inside the servant.
 pub async fn inside(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Extension(caller): Extension<Caller>,
-    mut request: Request,
+    request: Request,
 ) -> Result<Response, Error> {
-    let handle = app.choreographer.servant(&id)?;
-    let part = part(&app, &caller, &handle)?;
-    let accept = handshake::accept(&request)?;
+    let door = Door::of(&app, &id, caller)?;
     let protocol = robots::rosbridge_protocol(request.headers())?;
-    let Some(reach) = handle.reach() else {
-        return Err(Error::NotThereYet(id));
-    };
-    let place = app.inside.place(&id, &caller.who.principal.name)?;
-    let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
-        return Err(Error::BadRequest(
-            "this connection cannot become a WebSocket".to_owned(),
-        ));
-    };
-    notes(&app, &caller, &handle)("looks inside");
-    let sessions = app.sessions.clone();
-    sessions.spawn(async move {
-        match upgrade.await {
-            Ok(upgraded) => {
-                let (io, read_ahead) = robots::unwrapped(upgraded);
-                let budget = app.choreographer.memory();
-                let budget = budget.client(&caller.peer.client(None));
-                let waiting = Waiting::new(io, &read_ahead, app.choreographer.bridge_options())
-                    .within(&budget);
-                session(app, handle, caller, part, reach, (waiting, budget)).await;
-            }
-            Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
-        }
-        drop(place);
-    });
-    let mut response = Response::new(Body::empty());
-    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
-    let headers = response.headers_mut();
-    headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
-    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
-    if let Some(protocol) = protocol {
-        let protocol = HeaderValue::from_static(protocol);
-        headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
-    }
-    Ok(response)
-}
-
-async fn session(
-    app: Arc<App>,
-    handle: Arc<Handle>,
-    caller: Caller,
-    part: Part,
-    reach: Arc<dyn Reach>,
-    (waiting, budget): (Waiting<reach::Stream>, budget::Budget),
-) {
-    let service = handle.service().to_owned();
-    let (standing, granted) =
-        watch::channel(app.principals.standing_inside(&caller.who, &service, part));
-    let refused = notes(&app, &caller, &handle);
-    let used = notes(&app, &caller, &handle);
-    let options = SessionOptions {
-        budget,
-        client: caller.who.principal.name.clone(),
-        granted: Granted::by(granted)
-            .telling(move |operation| refused(&format!("was refused {operation}")))
-            .noting(move |operation| used(&format!("inside: {operation}"))),
-        ..SessionOptions::default()
-    };
-    let end = tokio::select! {
-        end = reach.serve_inside(waiting, options) => end,
-        () = app.principals.follow_inside(&caller.who, &service, part, &standing) => return,
-    };
-    tracing::debug!(
-        "{} looks into servant {} no more: {end:?}",
-        caller.who.principal,
-        handle.id
-    );
+    let bridge = app.choreographer.bridge_options().clone();
+    door.open(request, protocol, async move |looker, io, read_ahead| {
+        let waiting = Waiting::new(io, &read_ahead, &bridge).within(&looker.budget);
+        let who = &looker.caller.who.principal;
+        let options = SessionOptions {
+            budget: looker.budget,
+            client: who.name.clone(),
+            granted: looker.granted,
+            ..SessionOptions::default()
+        };
+        let end = looker.reach.serve_inside(waiting, options).await;
+        let id = &looker.handle.id;
+        tracing::debug!("{who} looks into servant {id} no more: {end:?}");
+    })
 }
 
 /// Records what somebody does inside; where it is done again and again, once a minute.

@@ -5,6 +5,7 @@
 //!                      who asks    may they  ├─▶ /healthz /metrics /assets
 //!                                            ├─▶ /api/v1      what cloudroidctl does
 //!                                            ├─▶ /v2          images, read-only (OCI distribution)
+//!                                            ├─▶ /foxglove   viewers, beside a servant's robot
 //!                                            ├─▶ /stubs       what robots install in a package's place
 //!                                            └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
@@ -49,6 +50,7 @@ mod stream;
 mod stubs;
 mod tls;
 mod tokens;
+mod viewers;
 mod views;
 
 use std::sync::Arc;

@@ -16,7 +16,7 @@ use utoipa::openapi::Required;
 
 use super::{
     App, api_v1, audit, calibration, dictionary, differences, events, history, inside, machines,
-    metrics, oci, openapi, page, people, policy, push, robots, shadow, stream, stubs,
+    metrics, oci, openapi, page, people, policy, push, robots, shadow, stream, stubs, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -566,6 +566,7 @@ pub const ROUTES: &[Route] = &[
     at("GET", "/v2/{name}/blobs/{digest}", service(See), || get(oci::blob)),
     at("GET", "/stubs", ENTER, || get(stubs::list)),
     at("GET", "/stubs/{file}", May(See, Of::Stub("file")), || get(stubs::archive)),
+    at("GET", "/foxglove/{id}", servant(See), || get(viewers::viewer)),
     at("ANY", "/{service}", Connect, || any(robots::service)),
     at("ANY", "/{service}/", Connect, || {
         any(robots::service_with_slash)

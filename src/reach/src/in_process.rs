@@ -13,7 +13,7 @@ use ros::schema::Registry;
 use ros::sizes::Seen;
 use tokio::sync::watch;
 
-use crate::inside::{Inside, Joining};
+use crate::inside::{Inside, Joining, Looked};
 use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
 use crate::tap::Tap;
 use crate::trial::{self, Material, Pace, Replay};
@@ -113,6 +113,10 @@ impl Reach for InProcess {
 
     async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd {
         self.inside.serve(client, options).await
+    }
+
+    async fn look_inside(&self) -> Result<Looked, (u16, String)> {
+        self.inside.look().await
     }
 
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {

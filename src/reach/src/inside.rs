@@ -9,6 +9,7 @@ use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError};
 use ros::schema::Registry;
+use tokio::sync::watch;
 
 use crate::Stream;
 
@@ -34,8 +35,26 @@ pub(crate) struct Inside {
 #[derive(Default)]
 struct State {
     /// There while somebody looks.
-    bridge: Weak<Bridge>,
-    closed: Option<String>,
+    looking: Weak<Looking>,
+    /// Why nobody looks any more.
+    closed: watch::Sender<Option<String>>,
+}
+
+/// The node of those who look, and a bridge on it for those who speak rosbridge.
+struct Looking {
+    bus: Arc<dyn Bus>,
+    bridge: Arc<Bridge>,
+}
+
+/// The servant's ROS as those see it who look, for as long as this lives.
+pub struct Looked {
+    /// Its ROS.
+    pub bus: Arc<dyn Bus>,
+    /// Its definitions.
+    pub registry: Arc<Registry>,
+    /// Why it has ended, once it has.
+    pub ended: watch::Receiver<Option<String>>,
+    _looking: Arc<Looking>,
 }
 
 impl Inside {
@@ -69,8 +88,8 @@ impl Inside {
         mut client: Waiting<Stream>,
         options: SessionOptions,
     ) -> SessionEnd {
-        let (code, reason) = match client.until(self.bridge()).await {
-            Ok(Ok(bridge)) => return bridge.serve_waiting(client, options).await,
+        let (code, reason) = match client.until(self.looking()).await {
+            Ok(Ok(looking)) => return looking.bridge.serve_waiting(client, options).await,
             Ok(Err(refused)) => refused,
             Err(left) => return left,
         };
@@ -78,44 +97,61 @@ impl Inside {
         SessionEnd::Closed { code, reason }
     }
 
+    /// The servant's ROS for somebody who looks; else code and reason to close with.
+    pub(crate) async fn look(&self) -> Result<Looked, (u16, String)> {
+        let looking = self.looking().await?;
+        Ok(Looked {
+            bus: Arc::clone(&looking.bus),
+            registry: Arc::clone(&self.registry),
+            ended: self.state.lock().closed.subscribe(),
+            _looking: looking,
+        })
+    }
+
     /// Ends all who look, and refuses others, with these words.
     pub(crate) fn close(&self, reason: &str) {
-        let bridge = {
-            let mut state = self.state.lock();
-            state.closed.get_or_insert_with(|| reason.to_owned());
-            state.bridge.upgrade()
+        let looking = {
+            let state = self.state.lock();
+            state.closed.send_if_modified(|closed| {
+                let is_first = closed.is_none();
+                closed.get_or_insert_with(|| reason.to_owned());
+                is_first
+            });
+            state.looking.upgrade()
         };
-        if let Some(bridge) = bridge {
-            bridge.close(reason);
+        if let Some(looking) = looking {
+            looking.bridge.close(reason);
         }
     }
 
-    /// The bridge that is there, or a new one; else code and reason to close with.
-    async fn bridge(&self) -> Result<Arc<Bridge>, (u16, String)> {
+    /// The node that is there, or a new one; else code and reason to close with.
+    async fn looking(&self) -> Result<Arc<Looking>, (u16, String)> {
         let _turn = self.turn.lock().await;
-        if let Some(bridge) = self.there()? {
-            return Ok(bridge);
+        if let Some(looking) = self.there()? {
+            return Ok(looking);
         }
         let joined = (self.join)().await;
         let bus = joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
-        let bridge = Bridge::new(bus, Arc::clone(&self.registry), self.options.clone());
+        let registry = Arc::clone(&self.registry);
+        let bridge = Bridge::new(Arc::clone(&bus), registry, self.options.clone());
+        let looking = Arc::new(Looking { bus, bridge });
         let mut state = self.state.lock();
         // It may have been closed meanwhile.
         state.check()?;
-        state.bridge = Arc::downgrade(&bridge);
-        Ok(bridge)
+        state.looking = Arc::downgrade(&looking);
+        Ok(looking)
     }
 
-    fn there(&self) -> Result<Option<Arc<Bridge>>, (u16, String)> {
+    fn there(&self) -> Result<Option<Arc<Looking>>, (u16, String)> {
         let state = self.state.lock();
         state.check()?;
-        Ok(state.bridge.upgrade())
+        Ok(state.looking.upgrade())
     }
 }
 
 impl State {
     fn check(&self) -> Result<(), (u16, String)> {
-        match &self.closed {
+        match &*self.closed.borrow() {
             Some(reason) => Err((ENDS, reason.clone())),
             None => Ok(()),
         }

@@ -54,6 +54,7 @@ use links::LinkStatus;
 use tap::Tap;
 
 pub use ends::how_it_ended;
+pub use inside::Looked;
 pub use local::LocalOpener;
 pub use nodes::LinkedNodes;
 pub use request_times::RequestTimes;
@@ -160,6 +161,8 @@ pub trait Reach: Send + Sync + 'static {
     -> SessionEnd;
     /// Speaks rosbridge with somebody who looks into it, until that ends: beside its robot, and none of its sessions.
     async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd;
+    /// Its ROS for somebody who looks into it by another protocol; else code (RFC 6455) and reason to close with.
+    async fn look_inside(&self) -> Result<Looked, (u16, String)>;
     /// Serves a stub's connection behind its upgrade, until it ends; `read_ahead` was read from it already.
     async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
     /// Where to hear what its robot asks of it; none where nobody can.

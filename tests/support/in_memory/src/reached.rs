@@ -10,8 +10,8 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
 use reach::{
-    Error, Flow, Look, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded, Replay,
-    Stream, Tenant,
+    Error, Flow, Look, Looked, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded,
+    Replay, Stream, Tenant,
 };
 use ros::bus::{Bus, Graph, RosVersion};
 use ros::sizes::Seen;
@@ -98,6 +98,10 @@ impl Reach for MemoryReach {
         let reason = self.end().await;
         client.refuse(1012, &reason).await;
         SessionEnd::Closed { code: 1012, reason }
+    }
+
+    async fn look_inside(&self) -> Result<Looked, (u16, String)> {
+        Err((1011, "nothing passes here".to_owned()))
     }
 
     async fn serve_link(&self, _stream: Stream, _read_ahead: &[u8]) -> Lost {

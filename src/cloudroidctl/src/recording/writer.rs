@@ -1,0 +1,203 @@
+//! Writes messages as they come. Every second what came is written out: whatever ends this, the file can be read up to there.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use mcap::WriteOptions;
+use mcap::records::MessageHeader;
+use serde::Serialize;
+
+/// A file that is being written.
+pub struct Writer {
+    path: PathBuf,
+    file: mcap::Writer<BufWriter<File>>,
+    topics: BTreeMap<u16, Topic>,
+}
+
+struct Topic {
+    name: String,
+    of: String,
+    messages: u32,
+    bytes: u64,
+}
+
+/// What a file holds.
+#[derive(Debug, Serialize)]
+pub struct Summary {
+    /// Where it is.
+    pub file: PathBuf,
+    /// Its size in bytes.
+    pub size: u64,
+    /// Of all topics.
+    pub messages: u64,
+    /// By name.
+    pub topics: Vec<TopicSummary>,
+}
+
+/// What a file holds of one topic.
+#[derive(Debug, Serialize)]
+pub struct TopicSummary {
+    /// Its name.
+    pub topic: String,
+    /// `package/Type`.
+    #[serde(rename = "type")]
+    pub of: String,
+    /// How many.
+    pub messages: u32,
+    /// Of them, before they were compressed.
+    pub bytes: u64,
+}
+
+impl Writer {
+    /// Makes a file that is not there yet.
+    pub fn create(path: &Path) -> anyhow::Result<Self> {
+        let mut options = OpenOptions::new();
+        let file = options.write(true).create_new(true).open(path);
+        let file = file.with_context(|| {
+            format!(
+                "{} cannot be made; -o names another file, which is not there yet",
+                path.display()
+            )
+        })?;
+        let options = WriteOptions::new()
+            .profile("ros1")
+            .library(concat!("cloudroidctl ", env!("CARGO_PKG_VERSION")));
+        let file = options
+            .create(BufWriter::new(file))
+            .with_context(|| unwritable(path))?;
+        Ok(Self {
+            path: path.to_owned(),
+            file,
+            topics: BTreeMap::new(),
+        })
+    }
+
+    /// The channel of a topic whose messages are of type `of`, as `definition` says.
+    pub fn channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> anyhow::Result<u16> {
+        let unwritable = || unwritable(&self.path);
+        let schema = self.file.add_schema(of, "ros1msg", definition);
+        let schema = schema.with_context(unwritable)?;
+        let channel = self
+            .file
+            .add_channel(schema, topic, "ros1", &BTreeMap::new());
+        let channel = channel.with_context(unwritable)?;
+        self.topics.entry(channel).or_insert_with(|| Topic {
+            name: topic.to_owned(),
+            of: of.to_owned(),
+            messages: 0,
+            bytes: 0,
+        });
+        Ok(channel)
+    }
+
+    /// Adds a message that was heard at `time`, in nanoseconds since 1970.
+    pub fn add(&mut self, channel_id: u16, time: u64, message: &[u8]) -> anyhow::Result<()> {
+        let mut sequence = 0;
+        if let Some(topic) = self.topics.get_mut(&channel_id) {
+            sequence = topic.messages;
+            topic.messages += 1;
+            topic.bytes += message.len() as u64;
+        }
+        let header = MessageHeader {
+            channel_id,
+            sequence,
+            log_time: time,
+            publish_time: time,
+        };
+        let written = self.file.write_to_known_channel(&header, message);
+        written.with_context(|| unwritable(&self.path))
+    }
+
+    /// Writes out what has come.
+    pub fn flush(&mut self) -> anyhow::Result<()> {
+        self.file.flush().with_context(|| unwritable(&self.path))
+    }
+
+    /// How many messages there are by now.
+    pub fn messages(&self) -> u64 {
+        let all = self.topics.values();
+        all.map(|topic| u64::from(topic.messages)).sum()
+    }
+
+    /// Ends the file with its index.
+    pub fn finish(mut self) -> anyhow::Result<Summary> {
+        self.file.finish().with_context(|| unwritable(&self.path))?;
+        let messages = self.messages();
+        let mut topics: Vec<_> = self
+            .topics
+            .into_values()
+            .map(|topic| TopicSummary {
+                topic: topic.name,
+                of: topic.of,
+                messages: topic.messages,
+                bytes: topic.bytes,
+            })
+            .collect();
+        topics.sort_by(|a, b| a.topic.cmp(&b.topic));
+        let size = std::fs::metadata(&self.path).map_or(0, |found| found.len());
+        Ok(Summary {
+            file: self.path,
+            size,
+            messages,
+            topics,
+        })
+    }
+}
+
+fn unwritable(path: &Path) -> String {
+    format!(
+        "{} cannot be written to its end; what it holds by now can be read",
+        path.display()
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::Reader;
+
+    #[test]
+    fn what_is_written_is_read_and_a_file_that_breaks_off_up_to_there() {
+        let place = tempfile::tempdir().expect("a directory");
+        let path = place.path().join("x.mcap");
+        let mut writer = Writer::create(&path).expect("a new file");
+        let text = writer.channel("/chatter", "std_msgs/String", b"string data");
+        let text = text.expect("a channel");
+        let same = writer.channel("/chatter", "std_msgs/String", b"string data");
+        assert_eq!(same.expect("the same"), text);
+        for time in 1..=3 {
+            let message = format!("word {time}");
+            writer
+                .add(text, time, message.as_bytes())
+                .expect("is written");
+        }
+        writer.flush().expect("is written");
+        let cut = place.path().join("cut.mcap");
+        std::fs::copy(&path, &cut).expect("a copy");
+        let summary = writer.finish().expect("an end");
+        assert_eq!((summary.messages, summary.topics[0].messages), (3, 3));
+        assert_eq!(summary.topics[0].bytes, 3 * 6);
+
+        let read = |path: &Path| {
+            let mut reader = Reader::open(path).expect("it opens");
+            let mut found = Vec::new();
+            while let Some(played) = reader.next().expect("it is read") {
+                assert_eq!(played.topic, "/chatter");
+                assert_eq!(played.of, "std_msgs/String");
+                found.push((played.time, played.message.to_vec()));
+            }
+            (found, reader.breaks_off())
+        };
+        let words: Vec<_> = (1..=3)
+            .map(|time| (time, format!("word {time}").into_bytes()))
+            .collect();
+        assert_eq!(read(&path), (words.clone(), false));
+        assert_eq!(read(&cut), (words, true));
+
+        let error = Writer::create(&path).err().expect("it is there");
+        assert!(format!("{error:#}").contains("exists"), "{error:#}");
+    }
+}

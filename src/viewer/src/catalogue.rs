@@ -1,0 +1,169 @@
+//! What is told to be there: topics as channels, and services, each by a number that is never given twice.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use ros::bus::{Graph, WireType};
+use ros::schema::ServiceDef;
+
+/// Topics that a viewer is told of at most, and services.
+const MOST: usize = 2_000;
+
+/// What a viewer has been told of.
+#[derive(Default)]
+pub struct Catalogue {
+    last: u32,
+    channels: BTreeMap<u64, (String, Arc<WireType>)>,
+    services: BTreeMap<u32, (String, Arc<ServiceDef>)>,
+    /// Whose types are being asked for.
+    asked: BTreeSet<String>,
+}
+
+/// What has changed in the graph.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Changes {
+    /// Topics that are new, with their types as registered.
+    pub topics: Vec<(String, String)>,
+    /// Services that are new.
+    pub services: Vec<String>,
+    /// Channels that are gone.
+    pub channels_gone: Vec<u64>,
+    /// Services that are gone.
+    pub services_gone: Vec<u32>,
+}
+
+impl Catalogue {
+    /// What `graph` has, as far as it `may` be heard, and was not told of, and what is not there any more. `own`: the node that looks.
+    pub fn changes(&mut self, graph: &Graph, own: &str, may: impl Fn(&str) -> bool) -> Changes {
+        let published = |name: &str| {
+            let topic = graph.topics.get(name);
+            topic.is_some_and(|topic| topic.publishers.iter().any(|node| node != own))
+        };
+        let served = |name: &str| graph.services.get(name).is_some_and(|node| node != own);
+        let mut changes = Changes::default();
+        self.channels.retain(|id, (topic, _)| {
+            let stays = published(topic) && may(topic);
+            if !stays {
+                changes.channels_gone.push(*id);
+            }
+            stays
+        });
+        self.services.retain(|id, (service, _)| {
+            let stays = served(service);
+            if !stays {
+                changes.services_gone.push(*id);
+            }
+            stays
+        });
+        self.asked.retain(|name| published(name) || served(name));
+        let known: BTreeSet<&String> = self.channels.values().map(|(topic, _)| topic).collect();
+        let called: BTreeSet<&String> = self.services.values().map(|(name, _)| name).collect();
+        for (name, topic) in &graph.topics {
+            let is_new = !known.contains(name) && !self.asked.contains(name);
+            if is_new && published(name) && may(name) && known.len() < MOST {
+                changes.topics.push((name.clone(), topic.type_name.clone()));
+            }
+        }
+        for name in graph.services.keys() {
+            let is_new = !called.contains(name) && !self.asked.contains(name);
+            if is_new && served(name) && called.len() < MOST {
+                changes.services.push(name.clone());
+            }
+        }
+        let asked = changes.topics.iter().map(|(name, _)| name);
+        self.asked.extend(asked.chain(&changes.services).cloned());
+        changes
+    }
+
+    /// The number of a topic whose type is known now; none where it is gone.
+    pub fn add_topic(&mut self, topic: &str, of: Arc<WireType>) -> Option<u64> {
+        if !self.asked.remove(topic) {
+            return None;
+        }
+        self.last += 1;
+        let id = u64::from(self.last);
+        self.channels.insert(id, (topic.to_owned(), of));
+        Some(id)
+    }
+
+    /// The number of a service whose type is known now; none where it is gone.
+    pub fn add_service(&mut self, service: &str, of: Arc<ServiceDef>) -> Option<u32> {
+        if !self.asked.remove(service) {
+            return None;
+        }
+        self.last += 1;
+        self.services.insert(self.last, (service.to_owned(), of));
+        Some(self.last)
+    }
+
+    /// A topic and its type.
+    pub fn channel(&self, id: u64) -> Option<&(String, Arc<WireType>)> {
+        self.channels.get(&id)
+    }
+
+    /// A service and its type.
+    pub fn service(&self, id: u32) -> Option<&(String, Arc<ServiceDef>)> {
+        self.services.get(&id)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::bus::TopicNodes;
+
+    use super::*;
+
+    fn graph(topics: &[(&str, &str)]) -> Graph {
+        let topic = |(name, publisher): &(&str, &str)| {
+            let ends = TopicNodes {
+                type_name: "std_msgs/String".into(),
+                publishers: vec![(*publisher).to_owned()],
+                subscribers: Vec::new(),
+            };
+            ((*name).to_owned(), ends)
+        };
+        Graph {
+            topics: topics.iter().map(topic).collect(),
+            ..Graph::default()
+        }
+    }
+
+    #[test]
+    fn what_comes_and_goes_is_told_once_and_by_new_numbers() {
+        let mut catalogue = Catalogue::default();
+        let names = |changes: &Changes| -> Vec<String> {
+            changes
+                .topics
+                .iter()
+                .map(|(name, _)| name.clone())
+                .collect()
+        };
+        let all = graph(&[("/a", "/n"), ("/own", "/viewer"), ("/secret", "/n")]);
+        let may = |name: &str| name != "/secret";
+        let first = catalogue.changes(&all, "/viewer", may);
+        assert_eq!(names(&first), ["/a"]);
+        assert_eq!(
+            catalogue.changes(&all, "/viewer", may),
+            Changes::default(),
+            "it is asked for"
+        );
+        let of = Arc::new(WireType::named("std_msgs/String"));
+        let id = catalogue
+            .add_topic("/a", Arc::clone(&of))
+            .expect("asked for");
+        assert_eq!(catalogue.add_topic("/a", Arc::clone(&of)), None, "once");
+        assert_eq!(catalogue.changes(&all, "/viewer", may), Changes::default());
+        let gone = catalogue.changes(&graph(&[]), "/viewer", may);
+        assert_eq!(gone.channels_gone, [id]);
+        let again = catalogue.changes(&all, "/viewer", may);
+        assert_eq!(names(&again), ["/a"]);
+        assert_ne!(
+            catalogue.add_topic("/a", of),
+            Some(id),
+            "a number is given once"
+        );
+        // What may not be heard any more is gone, too.
+        let refused = catalogue.changes(&all, "/viewer", |_| false);
+        assert_eq!(refused.channels_gone.len(), 1);
+    }
+}

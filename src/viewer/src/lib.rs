@@ -1,0 +1,16 @@
+//! Viewers (Foxglove, Lichtblick) on a servant's ROS: version 1 of Foxglove's WebSocket protocol, whose messages the crate `foxglove`
+//! reads and writes. Messages of ROS pass as the bytes that they are.
+//!
+//! ```text
+//!   graph ──▶ catalogue ──advertise──▶ ┐                ┌──▶ publisher ──▶ bus
+//!   bus ──▶ subscription ──▶ queue ──▶ ├─▶ viewer ─▶ what it asks ──▶ call ──▶ bus
+//!           newest win       16        ┘                └──▶ parameters
+//! ```
+
+#![deny(unsafe_code)]
+
+mod catalogue;
+mod parameters;
+mod session;
+
+pub use session::{DEPTH, PROTOCOLS, Servant, ViewerOptions, serve};

@@ -1,0 +1,45 @@
+"""Talks to sights_py with roslibpy, fifty words a second, until its standard input ends. Prints what it heard, as JSON.
+
+usage: talks_with_roslibpy.py URL
+"""
+
+import json
+import sys
+import threading
+import time
+
+import roslibpy
+
+PATIENCE = 60.0
+
+
+def main(url):
+    ros = roslibpy.Ros(url)
+    ros.run(timeout=PATIENCE)
+    heard, begun = [], threading.Event()
+
+    def hears(message):
+        heard.append(message["data"])
+        begun.set()
+
+    roslibpy.Topic(ros, "/sights/said", "std_msgs/String").subscribe(hears)
+    say = roslibpy.Topic(ros, "/sights/say", "std_msgs/String")
+    say.advertise()
+    over = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+    number = 0
+    while not over.wait(0.02):
+        number += 1
+        say.publish(roslibpy.Message({"data": f"word {number}"}))
+        if begun.is_set():
+            begun.clear()
+            if len(heard) == 1:
+                print("heard", flush=True)
+    deadline = time.monotonic() + PATIENCE
+    while heard[-1:] != [f"word {number}"] and time.monotonic() < deadline:
+        time.sleep(0.02)
+    print(json.dumps(heard))
+    ros.terminate()
+
+
+main(sys.argv[1])

@@ -1,0 +1,295 @@
+//! What flows in a servant is recorded, read by the format's own readers, and replayed.
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::{Value, json};
+use support::Verdict;
+use support::binaries;
+use support::deployer::{path_str, run};
+use support::world::world;
+
+use crate::inside::Scene;
+
+/// What the format's own Python package finds in a file.
+fn reads(file: &Path) -> anyhow::Result<Value> {
+    let said = with_python("read", file)?;
+    Ok(serde_json::from_str(&said)?)
+}
+
+fn with_python(verb: &str, file: &Path) -> anyhow::Result<String> {
+    let program = binaries::checkout().join("tests/readers/recording.py");
+    let mut reader = Command::new(binaries::readers().join("python"));
+    reader.arg(program).arg(verb).arg(file);
+    Ok(run(&mut reader)?.succeeded()?.stdout)
+}
+
+/// A robot that talks with roslibpy.
+struct Talker(Child);
+
+impl Talker {
+    /// Returns once it is answered.
+    fn begins(scene: &Scene) -> anyhow::Result<Talker> {
+        let url = scene
+            .daemon
+            .url(&format!("sights_py?token={}", scene.token));
+        let mut child = Command::new(binaries::python())
+            .arg(binaries::checkout().join("tests/robots/talks_with_roslibpy.py"))
+            .arg(url)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let mut line = String::new();
+        let mut out = BufReader::with_capacity(1, child.stdout.as_mut().context("piped")?);
+        out.read_line(&mut line)?;
+        ensure!(line == "heard\n", "{line}");
+        Ok(Talker(child))
+    }
+
+    /// What it has heard, once it has heard its last word.
+    fn ends(mut self) -> anyhow::Result<Vec<String>> {
+        drop(self.0.stdin.take());
+        let mut heard = String::new();
+        let out = self.0.stdout.as_mut().context("piped")?;
+        out.read_to_string(&mut heard)?;
+        ensure!(self.0.wait()?.success(), "{heard}");
+        Ok(serde_json::from_str(&heard)?)
+    }
+}
+
+impl Drop for Talker {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn texts(file: &Value, topic: &str) -> anyhow::Result<Vec<String>> {
+    Ok(serde_json::from_value(file["texts"][topic].clone())?)
+}
+
+pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
+    let mut scene = Scene::new("recordings", "")?;
+    let place = world().directory("recordings")?;
+    let file = place.path().join("said.mcap");
+    let talker = Talker::begins(&scene)?;
+    let typed = [
+        "--format",
+        "json",
+        "record",
+        &scene.servant,
+        "-o",
+        path_str(&file),
+        "--topic",
+        "/sights/sa*",
+        "--topic",
+        "/sights/map",
+        "--duration",
+        "3s",
+    ];
+    let outcome = scene.daemon.deployer().types(&typed)?.succeeded()?;
+    let summary: Value = serde_json::from_str(&outcome.stdout)?;
+    let heard = talker.ends()?;
+
+    let read = reads(&file)?;
+    ensure!(read["profile"] == "ros1", "{read}");
+    ensure!(
+        read["topics"]
+            == json!({"/sights/map": "nav_msgs/OccupancyGrid", "/sights/said": "std_msgs/String", "/sights/say": "std_msgs/String"}),
+        "{read}"
+    );
+    ensure!(read["messages"] == summary["messages"], "{read} {summary}");
+    // All that roslibpy heard from the first to the last of them.
+    let said = texts(&read, "/sights/said")?;
+    let first = heard.iter().position(|word| Some(word) == said.first());
+    let during = &heard[first.context("recorded and not heard")?..];
+    ensure!(
+        said.len() > 20 && during.starts_with(&said),
+        "{said:?} {during:?}"
+    );
+
+    // Replayed, the node answers as it did.
+    scene.rover.subscribes("/sights/said")?;
+    let replay = |more: &[&str]| {
+        let typed = ["replay", path_str(&file), "--to", &scene.servant];
+        scene.daemon.deployer().types(&[&typed, more].concat())
+    };
+    replay(&["--topic", "/sights/say", "--rate", "4"])?.succeeded()?;
+    for word in &texts(&read, "/sights/say")? {
+        let again = scene.rover.hears_on("/sights/said")?;
+        ensure!(again["data"] == word.as_str(), "{again}, not {word}");
+    }
+    replay(&["--topic", "/nothing"])?.failed_saying(&["no message of a wanted topic"])?;
+    // Who only looks may record, and publish nothing.
+    let eve = scene.viewer("eve", "sights*")?;
+    let server = format!("http://{}", scene.daemon.address);
+    let hers = [
+        "--server",
+        &server,
+        "--token",
+        &eve,
+        "--topic",
+        "/sights/say",
+    ];
+    replay(&hers)?.failed_saying(&["publish:/sights/say is not granted"])?;
+    scene.daemon.ends()?;
+    Ok(())
+}
+
+pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
+    let scene = Scene::new("recordings-bad", "")?;
+    let place = world().directory("recordings-bad")?;
+    let at = |name: &str| place.path().join(name);
+    let stranger = scene.viewer("stranger", "other*")?;
+    let types = |words: &[&str]| scene.daemon.deployer().types(words);
+
+    // Ctrl-C ends a recording, and so does the servant's end: both leave a whole file.
+    let begins = |name: &str| -> anyhow::Result<Child> {
+        let mut child = Command::new(binaries::path("cloudroidctl"))
+            .args(["record", "sights_py", "-o", path_str(&at(name))])
+            .args(["--topic", "/sights/scan"])
+            .env("CLOUDROID_HOME", &scene.daemon.deployer().home)
+            .env_remove("CLOUDROID_SERVER")
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        let mut line = String::new();
+        BufReader::new(child.stderr.as_mut().context("piped")?).read_line(&mut line)?;
+        ensure!(line.contains("Ctrl-C ends it"), "{line}");
+        // Written out every second, whatever comes after.
+        support::until("something in the file", || {
+            let size = std::fs::metadata(at(name))?.len();
+            Ok((size > 2000).then_some(()).ok_or(size.to_string()))
+        })?;
+        Ok(child)
+    };
+    let interrupted = begins("interrupted.mcap")?;
+    kill(
+        Pid::from_raw(i32::try_from(interrupted.id())?),
+        Signal::SIGINT,
+    )?;
+    let mut killed = begins("killed.mcap")?;
+    killed.kill()?;
+    killed.wait()?;
+    let served = begins("served.mcap")?;
+    types(&["stop", &scene.servant])?.succeeded()?;
+    for child in [interrupted, served] {
+        let ended = child.wait_with_output()?;
+        let said = String::from_utf8_lossy(&ended.stdout).into_owned();
+        ensure!(ended.status.success(), "{said}");
+        ensure!(
+            said.contains("/sights/scan  sensor_msgs/LaserScan"),
+            "{said}"
+        );
+    }
+    for name in ["interrupted.mcap", "served.mcap"] {
+        let read = reads(&at(name))?;
+        ensure!(
+            read["topics"] == json!({"/sights/scan": "sensor_msgs/LaserScan"}),
+            "{read}"
+        );
+    }
+
+    // Each in words, with the exit status that belongs to it.
+    std::fs::write(at("text.mcap"), "no recording")?;
+    with_python("foreign", &at("foreign.mcap"))?;
+    let mut rover = scene
+        .daemon
+        .robot(&format!("sights_py?token={}", scene.token))?;
+    rover.calls("/rosapi/get_time", json!({}))?;
+    let servant = scene.daemon.servant_of("sights_py", "rover")?;
+    let servant = servant["id"].as_str().context("an id")?;
+    let server = format!("http://{}", scene.daemon.address);
+    let (text, foreign, killed, new) = (
+        at("text.mcap"),
+        at("foreign.mcap"),
+        at("killed.mcap"),
+        at("new.mcap"),
+    );
+    let nowhere = at("no/such/directory.mcap");
+    let rows: [(&[&str], i32, &[&str]); 9] = [
+        (
+            &["record", servant, "-o", path_str(&text)],
+            1,
+            &["exists", "-o names another file"],
+        ),
+        (
+            &["record", servant, "-o", path_str(&nowhere)],
+            1,
+            &["cannot be made"],
+        ),
+        (
+            &["record", "nothing", "-o", path_str(&new)],
+            5,
+            &["nothing"],
+        ),
+        (
+            &[
+                "record",
+                servant,
+                "-o",
+                path_str(&new),
+                "--duration",
+                "soon",
+            ],
+            2,
+            &["--duration"],
+        ),
+        (
+            &[
+                "record",
+                servant,
+                "-o",
+                path_str(&new),
+                "--server",
+                &server,
+                "--token",
+                &stranger,
+            ],
+            4,
+            &["may not see"],
+        ),
+        (
+            &["replay", path_str(&text), "--to", servant],
+            1,
+            &["is no MCAP file"],
+        ),
+        (
+            &["replay", path_str(&new), "--to", servant],
+            1,
+            &["cannot be read"],
+        ),
+        (
+            &["replay", path_str(&foreign), "--to", servant],
+            1,
+            &["/chatter was left out", "servants take ros1"],
+        ),
+        (
+            &["replay", path_str(&text), "--to", servant, "--rate", "0"],
+            2,
+            &["more than 0"],
+        ),
+    ];
+    for (words, status, said) in rows {
+        let outcome = types(words)?.failed_saying(said)?;
+        ensure!(outcome.status == status, "{words:?}: {}", outcome.status);
+    }
+    ensure!(!new.exists(), "what failed leaves no file");
+    // What was being written when its program was killed is played up to there.
+    let outcome = types(&[
+        "replay",
+        path_str(&killed),
+        "--to",
+        servant,
+        "--rate",
+        "100",
+    ])?;
+    let outcome = outcome.succeeded()?;
+    ensure!(outcome.stderr.contains("breaks off"), "{}", outcome.said());
+    scene.daemon.ends()?;
+    Ok(())
+}
