@@ -234,8 +234,14 @@ fn main() -> ExitCode {
             looking_inside_keeps_no_servant_and_is_bounded,
             who_looks_slowly_costs_its_robot_nothing,
         ],
-        stories![recordings: a_recording_holds_what_a_robot_heard_and_is_replayed, what_cannot_be_recorded_or_replayed_is_said],
-        stories![viewers: foxgloves_client_hears_and_an_operators_acts, viewers_that_ask_badly_are_told_and_cost_nothing],
+        stories![recordings:
+            a_recording_holds_what_a_robot_heard_and_is_replayed,
+            what_cannot_be_recorded_or_replayed_is_said,
+        ],
+        stories![viewers:
+            foxgloves_client_hears_and_an_operators_acts,
+            viewers_that_ask_badly_are_told_and_cost_nothing,
+        ],
         stories![isolation:
             every_node_process_is_confined,
             nothing_of_ours_but_init_runs_inside,

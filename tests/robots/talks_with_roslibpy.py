@@ -27,14 +27,11 @@ def main(url):
     say.advertise()
     over = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+    threading.Thread(target=lambda: (begun.wait(), print("heard", flush=True)), daemon=True).start()
     number = 0
     while not over.wait(0.02):
         number += 1
         say.publish(roslibpy.Message({"data": f"word {number}"}))
-        if begun.is_set():
-            begun.clear()
-            if len(heard) == 1:
-                print("heard", flush=True)
     deadline = time.monotonic() + PATIENCE
     while heard[-1:] != [f"word {number}"] and time.monotonic() < deadline:
         time.sleep(0.02)

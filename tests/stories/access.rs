@@ -56,7 +56,8 @@ impl Row {
             true => "r1",
             false => "adder_py",
         };
-        let id = match self.path.contains("/servants/") {
+        let of_servants = ["/servants/", "/foxglove/"];
+        let id = match of_servants.iter().any(|part| self.path.contains(part)) {
             true => servant,
             false => "x",
         };

@@ -51,6 +51,7 @@ pub async fn viewer(
     let door = Door::of(&app, &id, caller)?;
     let protocol = protocol(request.headers())?;
     let depth = depth(request.uri().query())?;
+    let unfinished = app.choreographer.bridge_options().unfinished;
     door.open(
         request,
         Some(protocol),
@@ -60,6 +61,7 @@ pub async fn viewer(
                 name: format!("{} at {} ({id})", handle.robot, handle.service()),
                 granted: looker.granted,
                 budget: looker.budget,
+                unfinished,
                 depth,
             };
             let servant = async {

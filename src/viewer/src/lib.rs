@@ -10,6 +10,7 @@
 #![deny(unsafe_code)]
 
 mod catalogue;
+mod line;
 mod parameters;
 mod session;
 

@@ -22,20 +22,17 @@ use foxglove::ws_protocol::server::{
     ServiceCallFailure, ServiceCallResponse, Status, Unadvertise, UnadvertiseServices,
 };
 use foxglove::ws_protocol::{BinaryMessage, JsonMessage};
-use futures_util::{Sink, SinkExt, StreamExt};
 use ros::bus::{Bus, Graph, Publisher, Qos, Subscription, WireType, reaches};
 use ros::codec;
 use ros::schema::{MessageType, Registry, ServiceDef};
-use tokio::io::{AsyncRead, AsyncWrite, copy, empty};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::timeout;
-use tokio_tungstenite::WebSocketStream;
-use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
-use tokio_tungstenite::tungstenite::{Error, Message};
+use ws::WebSocket;
 
 use crate::catalogue::Catalogue;
+use crate::line::{Frame, Line, Read};
 use crate::parameters;
 
 /// Subprotocols that viewers ask for, the newest first. They are of one version: the older name is of the time before the protocol was
@@ -61,8 +58,11 @@ const ADVERTISEMENTS: usize = 512;
 const CALLS: usize = 32;
 /// Bytes of a message from a viewer.
 const LARGEST: usize = 16 << 20;
-/// A viewer that takes nothing for so long is let go.
-const STALLED: Duration = Duration::from_secs(30);
+/// Bytes that wait for the viewer; while there are more, it is neither asked nor given anything.
+const AHEAD: usize = 1 << 20;
+/// Close codes (RFC 6455): of a servant that ends, and of what is not allowed any more.
+const ENDED: u16 = 1012;
+const NOT_ALLOWED: u16 = 1008;
 /// For the answer to a call.
 const ANSWER: Duration = Duration::from_secs(60);
 
@@ -74,6 +74,8 @@ pub struct ViewerOptions {
     pub granted: Granted,
     /// What of its messages may be held at once, in bytes.
     pub budget: Budget,
+    /// Time from the first byte of a message of the viewer's to its last.
+    pub unfinished: Duration,
     /// How many messages of a topic wait for it.
     pub depth: usize,
 }
@@ -100,13 +102,8 @@ pub async fn serve<S>(
 ) where
     S: AsyncRead + AsyncWrite + Send + Unpin,
 {
-    let config = WebSocketConfig::default()
-        .max_message_size(Some(LARGEST))
-        .max_frame_size(Some(LARGEST));
-    let socket =
-        WebSocketStream::from_partially_read(io, read_ahead.into(), Role::Server, Some(config))
-            .await;
-    let (mut sink, mut incoming) = socket.split();
+    let socket = WebSocket::new(io, &read_ahead, LARGEST, LARGEST);
+    let mut line = Line::new(socket.within(&options.budget, options.unfinished));
     let Servant {
         bus,
         registry,
@@ -114,7 +111,7 @@ pub async fn serve<S>(
         held,
     } = match servant.await {
         Ok(servant) => servant,
-        Err((code, reason)) => return close(&mut sink, code.into(), &reason).await,
+        Err((code, reason)) => return line.close(code, &reason, true).await,
     };
     let (out, mut outgoing) = mpsc::channel(OUTGOING);
     let (found, mut types) = mpsc::channel(OUTGOING);
@@ -133,53 +130,45 @@ pub async fn serve<S>(
         shows_graph: None,
         budget: options.budget,
         depth: options.depth,
+        told: Vec::new(),
         out,
         found,
     };
-    let writes = async {
-        while let Some(message) = outgoing.recv().await {
-            let sent = timeout(STALLED, sink.send(message)).await;
-            if !matches!(sent, Ok(Ok(()))) {
-                return;
+    session.greet(&options.name);
+    let end = loop {
+        session.told.drain(..).for_each(|frame| line.send(frame));
+        // Who does not read is asked nothing more, and given nothing more.
+        let takes = line.queued() < AHEAD;
+        tokio::select! {
+            read = line.next(takes) => match read {
+                None => {}
+                Some(Read::Message(is_text, message)) => session.take(is_text, &message).await,
+                Some(Read::Left) => break End::Left,
+                Some(Read::Lost) => break End::Lost,
+                Some(Read::Refused(code, reason, readable)) => {
+                    break End::Close(code, reason, readable);
+                }
+            },
+            Some(frame) = outgoing.recv(), if takes => line.send(frame),
+            reason = end(&mut ended) => break End::Close(ENDED, reason, true),
+            changed = graph.changed() => {
+                if changed.is_err() {
+                    break End::Close(ENDED, "the servant has ended".to_owned(), true);
+                }
+                let now = Arc::clone(&graph.borrow_and_update());
+                session.look(&now);
+            }
+            Some(found) = types.recv() => session.add(found),
+            Some(ended) = session.tasks.join_next() => session.note(&ended),
+            () = session.granted.changed() => {
+                if let Some(reason) = session.granted.ended() {
+                    break End::Close(NOT_ALLOWED, reason, true);
+                }
+                let now = Arc::clone(&graph.borrow_and_update());
+                session.withdraw();
+                session.look(&now);
             }
         }
-    };
-    let works = async {
-        session.greet(&options.name).await;
-        loop {
-            tokio::select! {
-                message = incoming.next() => match message {
-                    Some(Ok(Message::Close(_))) | None => return None,
-                    Some(Ok(message)) => session.take(&message).await,
-                    Some(Err(Error::Capacity(error))) => {
-                        return Some((CloseCode::Size, error.to_string()));
-                    }
-                    Some(Err(_)) => return None,
-                },
-                reason = end(&mut ended) => return Some((CloseCode::Restart, reason)),
-                changed = graph.changed() => {
-                    if changed.is_err() {
-                        return Some((CloseCode::Restart, "the servant has ended".to_owned()));
-                    }
-                    let now = Arc::clone(&graph.borrow_and_update());
-                    session.look(&now).await;
-                }
-                Some(found) = types.recv() => session.add(found).await,
-                Some(ended) = session.tasks.join_next() => session.note(&ended),
-                () = session.granted.changed() => {
-                    if let Some(reason) = session.granted.ended() {
-                        return Some((CloseCode::Policy, reason));
-                    }
-                    let now = Arc::clone(&graph.borrow_and_update());
-                    session.withdraw();
-                    session.look(&now).await;
-                }
-            }
-        }
-    };
-    let end = tokio::select! {
-        () = writes => None,
-        end = works => end,
     };
     // What it has sent is published, even if it has left by then.
     session.subscriptions.clear();
@@ -192,18 +181,24 @@ pub async fn serve<S>(
         }
     };
     let _ = timeout(CONNECTS, published).await;
+    session.told.drain(..).for_each(|frame| line.send(frame));
     drop((session, held));
     match end {
-        Some((code, reason)) => {
-            close(&mut sink, code, &reason).await;
-            // What is still under way is read, or the reason would be lost with it.
-            if let Ok(socket) = sink.reunite(incoming) {
-                let _ = timeout(CONNECTS, copy(&mut socket.into_inner(), &mut empty())).await;
-            }
-        }
-        // Who says goodbye is answered, once what it sent is published.
-        None => drop(timeout(CONNECTS, sink.close()).await),
+        End::Close(code, reason, readable) => line.close(code, &reason, readable).await,
+        // Who waits for the answer knows by it that all is published.
+        End::Left => line.answer_goodbye().await,
+        End::Lost => {}
     }
+}
+
+/// How a connection ends.
+enum End {
+    /// The viewer has said goodbye.
+    Left,
+    /// It is gone.
+    Lost,
+    /// With a code and a reason; whether the viewer's bytes can still be told apart.
+    Close(u16, String, bool),
 }
 
 /// Returns once the servant has ended, why.
@@ -211,14 +206,6 @@ async fn end(ended: &mut watch::Receiver<Option<String>>) -> String {
     let reason = ended.wait_for(Option::is_some).await;
     let reason = reason.ok().and_then(|reason| reason.clone());
     reason.unwrap_or_else(|| "the servant has ended".to_owned())
-}
-
-async fn close(sink: &mut (impl Sink<Message> + Unpin), code: CloseCode, reason: &str) {
-    // A control frame has room for so much (RFC 6455, section 5.5).
-    let end = (0..=123).rev().find(|end| reason.is_char_boundary(*end));
-    let reason = reason[..end.unwrap_or_default()].into();
-    let close = Message::Close(Some(CloseFrame { code, reason }));
-    let _ = timeout(STALLED, sink.send(close)).await;
 }
 
 /// A type that was asked for.
@@ -248,7 +235,10 @@ struct Session {
     shows_graph: Option<Arc<Graph>>,
     budget: Budget,
     depth: usize,
-    out: mpsc::Sender<Message>,
+    /// What it is to be told as soon as it can be.
+    told: Vec<Frame>,
+    /// What tasks tell.
+    out: mpsc::Sender<Frame>,
     found: mpsc::Sender<Found>,
 }
 
@@ -279,7 +269,7 @@ impl Drop for Subscribed {
 }
 
 impl Session {
-    async fn greet(&self, name: &str) {
+    fn greet(&mut self, name: &str) {
         let info = ServerInfo::new(name)
             .with_capabilities([
                 Capability::ClientPublish,
@@ -288,19 +278,19 @@ impl Session {
                 Capability::ConnectionGraph,
             ])
             .with_supported_encodings([ENCODING]);
-        self.tell(&info).await;
+        self.tell(&info);
     }
 
-    async fn tell(&self, message: &impl JsonMessage) {
-        let _ = self.out.send(Message::text(message.to_string())).await;
+    fn tell(&mut self, message: &impl JsonMessage) {
+        self.told.push(Frame::Text(message.to_string()));
     }
 
-    async fn complain(&self, words: impl Into<String>) {
-        self.tell(&Status::error(words)).await;
+    fn complain(&mut self, words: impl Into<String>) {
+        self.tell(&Status::error(words));
     }
 
     /// Tells what has come and gone.
-    async fn look(&mut self, graph: &Arc<Graph>) {
+    fn look(&mut self, graph: &Arc<Graph>) {
         let grants = self.granted.grants();
         let may = |topic: &str| grants.permits(Operation::Subscribe, topic);
         let changes = self.catalogue.changes(graph, self.bus.node(), may);
@@ -308,17 +298,16 @@ impl Session {
             let gone = &changes.channels_gone;
             self.subscriptions
                 .retain(|_, one| !gone.contains(&one.channel));
-            self.tell(&Unadvertise::new(gone.iter().copied())).await;
+            self.tell(&Unadvertise::new(gone.iter().copied()));
         }
         if !changes.services_gone.is_empty() {
-            self.tell(&UnadvertiseServices::new(changes.services_gone))
-                .await;
+            self.tell(&UnadvertiseServices::new(changes.services_gone));
         }
         for (topic, named) in changes.topics {
             match self.registry.message(&named) {
                 Ok(message) => {
                     let of = Arc::new(WireType::of(&message));
-                    self.add(Found::Topic(topic, of)).await;
+                    self.add(Found::Topic(topic, of));
                 }
                 // What is not in the image is told by who publishes it.
                 Err(_) => self.ask_topic(topic),
@@ -327,7 +316,7 @@ impl Session {
         for service in changes.services {
             self.ask_service(service);
         }
-        self.show_graph(graph).await;
+        self.show_graph(graph);
     }
 
     fn ask_topic(&mut self, topic: String) {
@@ -356,7 +345,7 @@ impl Session {
     }
 
     /// Tells of a topic or service whose type is known now.
-    async fn add(&mut self, found: Found) {
+    fn add(&mut self, found: Found) {
         match found {
             Found::Topic(topic, of) => {
                 let Some(id) = self.catalogue.add_topic(&topic, Arc::clone(&of)) else {
@@ -365,7 +354,7 @@ impl Session {
                 let schema = Schema::new(&of.name, SCHEMA, of.definition.as_bytes());
                 let channel = Channel::builder(id, &topic, ENCODING).with_schema(schema);
                 if let Ok(channel) = channel.build() {
-                    self.tell(&Advertise::new([channel])).await;
+                    self.tell(&Advertise::new([channel]));
                 }
             }
             Found::Service(service, of) => {
@@ -382,7 +371,7 @@ impl Session {
                         told.with_response(ENCODING, schema(response.name(), response.full_text()))
                     });
                 if let Ok(told) = told {
-                    self.tell(&AdvertiseServices::new([told])).await;
+                    self.tell(&AdvertiseServices::new([told]));
                 }
             }
         }
@@ -406,18 +395,23 @@ impl Session {
             .retain(|_, one| may(Operation::Publish, &one.topic));
     }
 
-    async fn take(&mut self, message: &Message) {
-        if matches!(message, Message::Ping(_) | Message::Pong(_)) {
-            return;
-        }
-        let message = match ClientMessage::try_from(message) {
+    async fn take(&mut self, is_text: bool, message: &[u8]) {
+        let message = match is_text {
+            true => std::str::from_utf8(message)
+                .map_err(|error| error.to_string())
+                .and_then(|text| {
+                    ClientMessage::parse_json(text).map_err(|error| error.to_string())
+                }),
+            false => ClientMessage::parse_binary(message).map_err(|error| error.to_string()),
+        };
+        let message = match message {
             Ok(message) => message,
-            Err(error) => return self.complain(format!("this is no message: {error}")).await,
+            Err(error) => return self.complain(format!("this is no message: {error}")),
         };
         match message {
             ClientMessage::Subscribe(wanted) => {
                 for one in wanted.subscriptions {
-                    self.subscribe(one.id, one.channel_id).await;
+                    self.subscribe(one.id, one.channel_id);
                 }
             }
             ClientMessage::Unsubscribe(wanted) => {
@@ -442,7 +436,7 @@ impl Session {
             ClientMessage::GetParameters(wanted) => {
                 // As it is for clients of rosbridge.
                 if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/get_param") {
-                    return self.complain(refused).await;
+                    return self.complain(refused);
                 }
                 self.tell_parameters(wanted.parameter_names, wanted.id)
                     .await;
@@ -451,33 +445,29 @@ impl Session {
             ClientMessage::SubscribeConnectionGraph => {
                 self.shows_graph = Some(Arc::default());
                 let now = Arc::clone(&self.bus.graph().borrow());
-                self.show_graph(&now).await;
+                self.show_graph(&now);
             }
             ClientMessage::UnsubscribeConnectionGraph => self.shows_graph = None,
             _ => {
                 let words = "this server does not do that: see its capabilities";
-                self.complain(words).await;
+                self.complain(words);
             }
         }
     }
 
-    async fn subscribe(&mut self, id: u32, channel: u64) {
+    fn subscribe(&mut self, id: u32, channel: u64) {
         let Some((topic, of)) = self.catalogue.channel(channel).cloned() else {
-            return self
-                .complain(format!("there is no channel {channel}"))
-                .await;
+            return self.complain(format!("there is no channel {channel}"));
         };
         if self.subscriptions.contains_key(&id) {
-            return self
-                .complain(format!("subscription {id} is there already"))
-                .await;
+            return self.complain(format!("subscription {id} is there already"));
         }
         if self.subscriptions.len() >= SUBSCRIPTIONS {
             let words = format!("{topic}: one viewer may have {SUBSCRIPTIONS} subscriptions");
-            return self.complain(words).await;
+            return self.complain(words);
         }
         if let Err(refused) = self.granted.check(Operation::Subscribe, &topic) {
-            return self.complain(refused).await;
+            return self.complain(refused);
         }
         let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
         let (listened, budget) = (topic.clone(), self.budget.clone());
@@ -498,7 +488,7 @@ impl Session {
                 Err(error) => {
                     let words = format!("{listened} cannot be subscribed to: {error}");
                     let _ = out
-                        .send(Message::text(Status::error(words).to_string()))
+                        .send(Frame::Text(Status::error(words).to_string()))
                         .await;
                 }
             }
@@ -512,24 +502,23 @@ impl Session {
         self.subscriptions.insert(id, subscribed);
     }
 
-    async fn publish(&self, id: u32, message: &[u8]) {
+    async fn publish(&mut self, id: u32, message: &[u8]) {
         let Some(published) = self.publishers.get(&id) else {
             let words = format!("channel {id} is not advertised by this viewer");
-            return self.complain(words).await;
+            return self.complain(words);
         };
         let Some(Publishing { of, messages }) = &published.publishing else {
             return;
         };
         if let Err(error) = codec::validate(of, message) {
             let words = format!("{}: this is no {}: {error}", published.topic, of.name());
-            return self.complain(words).await;
+            return self.complain(words);
         }
         match self.budget.take(message.len()) {
             // It is taken for as long as the sender is there.
             Ok(permit) => drop(messages.send(permit.around(message.to_vec())).await),
             Err(exceeded) => {
-                self.complain(format!("{}: {exceeded}", published.topic))
-                    .await;
+                self.complain(format!("{}: {exceeded}", published.topic));
             }
         }
     }
@@ -537,14 +526,12 @@ impl Session {
     async fn advertise(&mut self, channel: client::advertise::Channel<'_>) {
         let id = channel.id;
         if self.publishers.contains_key(&id) {
-            return self
-                .complain(format!("channel {id} is there already"))
-                .await;
+            return self.complain(format!("channel {id} is there already"));
         }
         let topic = channel.topic.clone().into_owned();
         if self.publishers.len() >= ADVERTISEMENTS {
             let words = format!("{topic}: one viewer may advertise {ADVERTISEMENTS} topics");
-            return self.complain(words).await;
+            return self.complain(words);
         }
         let publishing = match self.publisher(&topic, &channel).await {
             Ok((of, publisher)) => Some(Publishing {
@@ -552,7 +539,7 @@ impl Session {
                 messages: self.publishing(&topic, publisher),
             }),
             Err(words) => {
-                self.complain(words).await;
+                self.complain(words);
                 None
             }
         };
@@ -606,7 +593,7 @@ impl Session {
             Ok(found) => found,
             Err(words) => {
                 let failure = ServiceCallFailure::new(service_id, call_id, words);
-                return self.tell(&failure).await;
+                return self.tell(&failure);
             }
         };
         self.calls += 1;
@@ -623,12 +610,12 @@ impl Session {
                         encoding: ENCODING.into(),
                         payload: (&answer[..]).into(),
                     };
-                    Message::binary(response.to_bytes())
+                    Frame::Binary(response.to_bytes().into())
                 }
                 Err(error) => {
                     let words = format!("{service}: {error}");
                     let failure = ServiceCallFailure::new(service_id, call_id, words);
-                    Message::text(failure.to_string())
+                    Frame::Text(failure.to_string())
                 }
             };
             let _ = out.send(message).await;
@@ -661,7 +648,7 @@ impl Session {
     }
 
     /// All of them where none is named.
-    async fn tell_parameters(&self, names: Vec<String>, id: Option<String>) {
+    async fn tell_parameters(&mut self, names: Vec<String>, id: Option<String>) {
         let bus = &self.bus;
         let read = async {
             let parameters = bus.parameters()?;
@@ -684,18 +671,15 @@ impl Session {
                     Some(id) => told.with_id(id),
                     None => told,
                 };
-                self.tell(&told).await;
+                self.tell(&told);
             }
-            Err(error) => {
-                self.complain(format!("parameters cannot be read: {error}"))
-                    .await
-            }
+            Err(error) => self.complain(format!("parameters cannot be read: {error}")),
         }
     }
 
-    async fn set_parameters(&self, wanted: client::SetParameters) {
+    async fn set_parameters(&mut self, wanted: client::SetParameters) {
         if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/set_param") {
-            return self.complain(refused).await;
+            return self.complain(refused);
         }
         let mut names = Vec::new();
         for one in wanted.parameters {
@@ -707,8 +691,7 @@ impl Session {
                 }
             };
             if let Err(error) = done.await {
-                self.complain(format!("{} cannot be set: {error}", one.name))
-                    .await;
+                self.complain(format!("{} cannot be set: {error}", one.name));
             }
             names.push(one.name);
         }
@@ -718,7 +701,7 @@ impl Session {
     }
 
     /// Tells what of the graph's connections has changed, where the viewer wants to know.
-    async fn show_graph(&mut self, now: &Arc<Graph>) {
+    fn show_graph(&mut self, now: &Arc<Graph>) {
         let Some(before) = self.shows_graph.replace(Arc::clone(now)) else {
             self.shows_graph = None;
             return;
@@ -757,7 +740,7 @@ impl Session {
             .filter(|name| !now.services.contains_key(*name));
         update.removed_services = gone.cloned().collect();
         if update != ConnectionGraphUpdate::default() {
-            self.tell(&update).await;
+            self.tell(&update);
         }
     }
 }
@@ -767,7 +750,7 @@ struct Reader {
     id: u32,
     topic: String,
     budget: Budget,
-    out: mpsc::Sender<Message>,
+    out: mpsc::Sender<Frame>,
     /// Messages for which there was no room in the budget.
     missed: u64,
     /// How many it was told to have missed, and when.
@@ -785,7 +768,7 @@ impl Reader {
                 continue;
             };
             let frame = permit.around(framed(self.id, now, &message.bytes));
-            if self.out.send(Message::Binary(frame)).await.is_err() {
+            if self.out.send(Frame::Binary(frame)).await.is_err() {
                 return;
             }
             let missed = self.missed + subscription.dropped.get();
@@ -796,7 +779,7 @@ impl Reader {
                     "{}: {missed} messages were left out, since they come faster than they are read",
                     self.topic
                 );
-                let status = Message::text(Status::warning(words).to_string());
+                let status = Frame::Text(Status::warning(words).to_string());
                 let _ = self.out.send(status).await;
             }
         }

@@ -146,6 +146,7 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
         format!("/{service}/"),
         format!("/api/v1/servants/{servant}"),
         format!("/api/v1/servants/{servant}/inside"),
+        format!("/foxglove/{servant}"),
     ] {
         attempts.push(Attempt::new("HEAD", path.clone(), NO));
         attempts.push(Attempt::new("GET", path, NO));

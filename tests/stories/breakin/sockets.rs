@@ -120,8 +120,15 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
             format!("api/v1/servants/{servant}/inside/"),
             format!("api/v1/servants/x/../{servant}/inside"),
             format!("api/v1/servants/{servant}/%69nside"),
+            format!("foxglove/{servant}"),
+            format!("foxglove/{servant}/"),
+            format!("foxglove/%2e%2e/{servant}"),
         ] {
-            let plain = path.ends_with("/inside") && !path.contains("..");
+            let door = [
+                format!("api/v1/servants/{servant}/inside"),
+                format!("foxglove/{servant}"),
+            ];
+            let plain = door.contains(&path);
             let status = if plain { status } else { &[400, 401, 403, 404] };
             attempts.push(((path, headers.clone()), status));
         }
