@@ -123,7 +123,7 @@ impl Reader {
                         _ => {}
                     }
                 }
-                Some(Err(McapError::UnexpectedEof)) => {
+                Some(Err(McapError::UnexpectedEof | McapError::UnexpectedEoc)) => {
                     self.breaks_off = true;
                     self.ended = true;
                 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
-use std::io::BufWriter;
+use std::io::{self, Cursor, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -13,9 +13,14 @@ use serde::Serialize;
 /// A file that is being written.
 pub struct Writer {
     path: PathBuf,
-    file: mcap::Writer<BufWriter<File>>,
+    file: mcap::Writer<Whole>,
     topics: BTreeMap<u16, Topic>,
+    /// Bytes of messages since the last flush.
+    pending: usize,
 }
+
+/// More bytes of messages than these are not held back.
+const PENDING: usize = 8 << 20;
 
 struct Topic {
     name: String,
@@ -66,12 +71,13 @@ impl Writer {
             .profile("ros1")
             .library(concat!("cloudroidctl ", env!("CARGO_PKG_VERSION")));
         let file = options
-            .create(BufWriter::new(file))
+            .create(Whole::of(file))
             .with_context(|| unwritable(path))?;
         Ok(Self {
             path: path.to_owned(),
             file,
             topics: BTreeMap::new(),
+            pending: 0,
         })
     }
 
@@ -108,11 +114,17 @@ impl Writer {
             publish_time: time,
         };
         let written = self.file.write_to_known_channel(&header, message);
-        written.with_context(|| unwritable(&self.path))
+        written.with_context(|| unwritable(&self.path))?;
+        self.pending += message.len();
+        match self.pending > PENDING {
+            true => self.flush(),
+            false => Ok(()),
+        }
     }
 
     /// Writes out what has come.
     pub fn flush(&mut self) -> anyhow::Result<()> {
+        self.pending = 0;
         self.file.flush().with_context(|| unwritable(&self.path))
     }
 
@@ -147,6 +159,51 @@ impl Writer {
     }
 }
 
+/// A file that is given whole chunks alone, by `flush`: half a chunk with the length of none could not be read, nor what comes before it
+/// by every program.
+struct Whole {
+    file: File,
+    /// Where the file ends.
+    end: u64,
+    next: Cursor<Vec<u8>>,
+}
+
+impl Whole {
+    fn of(file: File) -> Self {
+        Self {
+            file,
+            end: 0,
+            next: Cursor::default(),
+        }
+    }
+}
+
+impl Write for Whole {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.next.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        let next = std::mem::take(&mut self.next).into_inner();
+        self.end += next.len() as u64;
+        self.file.write_all(&next)
+    }
+}
+
+impl Seek for Whole {
+    /// Within what was not flushed yet.
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let to = match to {
+            SeekFrom::Start(at) => match at.checked_sub(self.end) {
+                Some(at) => SeekFrom::Start(at),
+                None => return Err(io::ErrorKind::InvalidInput.into()),
+            },
+            other => other,
+        };
+        Ok(self.end + self.next.seek(to)?)
+    }
+}
+
 fn unwritable(path: &Path) -> String {
     format!(
         "{} cannot be written to its end; what it holds by now can be read",
@@ -175,11 +232,15 @@ mod tests {
                 .expect("is written");
         }
         writer.flush().expect("is written");
+        // What comes then, in no chunk that is complete, is not there if this is the end.
+        for time in 4..1000 {
+            writer.add(text, time, &[b'x'; 1000]).expect("is written");
+        }
         let cut = place.path().join("cut.mcap");
         std::fs::copy(&path, &cut).expect("a copy");
         let summary = writer.finish().expect("an end");
-        assert_eq!((summary.messages, summary.topics[0].messages), (3, 3));
-        assert_eq!(summary.topics[0].bytes, 3 * 6);
+        assert_eq!((summary.messages, summary.topics[0].messages), (999, 999));
+        assert_eq!(summary.topics[0].bytes, 3 * 6 + 996 * 1000);
 
         let read = |path: &Path| {
             let mut reader = Reader::open(path).expect("it opens");
@@ -194,8 +255,16 @@ mod tests {
         let words: Vec<_> = (1..=3)
             .map(|time| (time, format!("word {time}").into_bytes()))
             .collect();
-        assert_eq!(read(&path), (words.clone(), false));
-        assert_eq!(read(&cut), (words, true));
+        assert_eq!(read(&cut), (words.clone(), true));
+        let (all, breaks_off) = read(&path);
+        assert_eq!((&all[..3], all.len(), breaks_off), (&words[..], 999, false));
+        // Wherever it is cut, all that came before is read.
+        let whole = std::fs::read(&path).expect("it is there");
+        for end in (600..whole.len()).step_by(101) {
+            std::fs::write(&cut, &whole[..end]).expect("is written");
+            let (found, breaks_off) = read(&cut);
+            assert!(breaks_off && all.starts_with(&found), "cut at {end}");
+        }
 
         let error = Writer::create(&path).err().expect("it is there");
         assert!(format!("{error:#}").contains("exists"), "{error:#}");
