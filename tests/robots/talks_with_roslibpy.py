@@ -1,4 +1,4 @@
-"""Talks to sights_py with roslibpy, fifty words a second, until its standard input ends. Prints what it heard, as JSON.
+"""Talks to sights_py with roslibpy, twenty words a second, until its standard input ends. Prints what it heard, as JSON.
 
 usage: talks_with_roslibpy.py URL
 """
@@ -29,7 +29,7 @@ def main(url):
     threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
     threading.Thread(target=lambda: (begun.wait(), print("heard", flush=True)), daemon=True).start()
     number = 0
-    while not over.wait(0.02):
+    while not over.wait(0.05):
         number += 1
         say.publish(roslibpy.Message({"data": f"word {number}"}))
     deadline = time.monotonic() + PATIENCE

@@ -109,7 +109,7 @@ clouds = [rospy.Publisher("~cloud" + end, PointCloud2, queue_size=1) for end in 
 moving = rospy.Publisher("/tf", TFMessage, queue_size=10)
 fixed = rospy.Publisher("/tf_static", TFMessage, queue_size=10, latch=True)
 maps = rospy.Publisher("~map", OccupancyGrid, queue_size=1, latch=True)
-said = rospy.Publisher("~said", String, queue_size=10)
+said = rospy.Publisher("~said", String, queue_size=1000)
 rospy.Subscriber("~say", String, said.publish)
 rospy.Service("~ping", Trigger, lambda _: TriggerResponse(True, "pong"))
 rospy.set_param("~gain", 2)
