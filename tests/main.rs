@@ -227,16 +227,19 @@ fn main() -> ExitCode {
         ],
         stories![images:
             skopeo_and_umoci_read_the_store,
+            an_exported_service_is_published_on_another_server,
             what_nobody_refers_to_is_collected,
         ],
         stories![inside:
             a_viewer_hears_and_does_nothing_and_an_operator_acts,
             looking_inside_keeps_no_servant_and_is_bounded,
             who_looks_slowly_costs_its_robot_nothing,
+            what_is_published_is_counted_and_goals_are_remembered,
         ],
         stories![recordings:
             a_recording_holds_what_a_robot_heard_and_is_replayed,
             what_cannot_be_recorded_or_replayed_is_said,
+            a_black_box_is_written_when_a_robot_waits_too_long,
         ],
         stories![viewers:
             foxgloves_client_hears_and_an_operators_acts,

@@ -51,7 +51,7 @@ impl Row {
     }
 
     /// With what there is in the story in place of parameters.
-    fn address(&self, servant: &str) -> String {
+    fn address(&self, servant: &str, recording: &str) -> String {
         let name = match self.path.contains("/robots/") {
             true => "r1",
             false => "adder_py",
@@ -64,6 +64,7 @@ impl Row {
         self.path
             .replace("{name}", name)
             .replace("{id}", id)
+            .replace("{number}", recording)
             .replace("{file}", "adder_py.tar.gz")
             .replace("{service}", "adder_py")
             .replace("{reference}", "x")
@@ -74,8 +75,14 @@ impl Row {
     fn asks(&self) -> &str {
         match (&*self.method, &*self.path) {
             ("ANY", _) => "GET",
-            // The one is long, the other has no end.
-            (_, "/stubs/{file}" | "/api/v1/stream" | "/api/v1/events/follow") => "HEAD",
+            // The one is long, the others have no end.
+            (
+                _,
+                "/stubs/{file}"
+                | "/api/v1/stream"
+                | "/api/v1/events/follow"
+                | "/api/v1/servants/{id}/topics",
+            ) => "HEAD",
             (method, _) => method,
         }
     }
@@ -132,7 +139,8 @@ pub fn expired(daemon: &Daemon) -> anyhow::Result<String> {
 }
 
 pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
-    let daemon = daemon("matrix")?;
+    let daemon = world().own("matrix");
+    let daemon = daemon.config("[black_box]\nseconds = \"1s\"\n").start()?;
     let mut rows = matrix()?;
     // Who shows a code is told by the stories of pairing.
     rows.retain(|row| row.path != "/api/v1/pair");
@@ -148,7 +156,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         if allowed && !row.reads() {
             continue;
         }
-        let (status, body) = asks(row, &row.address("x"), None)?;
+        let (status, body) = asks(row, &row.address("x", "1"), None)?;
         ensure!(
             (status != 403) == allowed && status != 401,
             "local {} {}: {status} {body}",
@@ -191,6 +199,15 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         Ok(servant.map_err(|error| format!("{error:#}")))
     })?;
     let servant = servant["id"].as_str().context("an id")?.to_owned();
+    let recording = support::until("a recording", || {
+        let taken =
+            daemon
+                .deployer()
+                .types(&["--format", "json", "recordings", "take", &servant])?;
+        let taken: Result<serde_json::Value, _> = serde_json::from_str(&taken.stdout);
+        let number = taken.map(|taken| taken[0]["number"].to_string());
+        Ok(number.map_err(|error| error.to_string()))
+    })?;
     let revoked = token(&daemon, &["over", "--role", "admin"])?;
     daemon
         .deployer()
@@ -198,7 +215,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         .succeeded()?;
     let expired = expired(&daemon)?;
     for row in &rows {
-        let address = row.address(&servant);
+        let address = row.address(&servant, &recording);
         for (role, own, foreign) in &principals {
             let cell = row.cell(role)?;
             // Of what the query or the body names, each is asked about its own: there is none here.

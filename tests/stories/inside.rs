@@ -1,8 +1,12 @@
 //! People look into a servant: they hear what flows there and, where they may, act on it, and are none of its robot's clients.
 
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
+
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
+use support::binaries;
 use support::daemon::Daemon;
 use support::robot::{PATIENCE, Refusal, Robot};
 use support::world::world;
@@ -380,6 +384,112 @@ pub fn who_looks_slowly_costs_its_robot_nothing() -> Verdict {
     ensure!(scene.told()?["dropped"] == 0, "{:#}", scene.told()?);
     // And what she is given at last is new, not what was so when she began.
     hears_a_picture(&mut slow)?;
+    scene.daemon.ends()?;
+    Ok(())
+}
+
+pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
+    let mut scene = Scene::new("counted", "")?;
+    // A line each second, until whoever asks leaves.
+    let mut counting = Command::new(binaries::path("cloudroidctl"))
+        .args(["--format", "json", "topics", &scene.servant])
+        .env("CLOUDROID_HOME", &scene.daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let lines = BufReader::new(counting.stdout.take().context("piped")?).lines();
+    let mut found = None;
+    for line in lines {
+        let told: Value = serde_json::from_str(&line?)?;
+        let of = |name: &str| -> Option<Value> {
+            let all = told["topics"].as_array()?;
+            all.iter().find(|one| one["topic"] == name).cloned()
+        };
+        let (Some(scan), Some(picture)) = (of("/sights/scan"), of("/sights/image/rgb8")) else {
+            continue;
+        };
+        if picture["rate"].as_f64() > Some(1.0) && scan["rate"].as_f64() > Some(1.0) {
+            found = Some((scan, picture));
+            break;
+        }
+    }
+    counting.kill()?;
+    counting.wait()?;
+    let (scan, picture) = found.context("scans and pictures that are counted")?;
+    ensure!(scan["type"] == "sensor_msgs/LaserScan", "{scan}");
+    let number = |of: &Value, key: &str| of[key].as_f64().unwrap_or_default();
+    // What a message has, rate and bandwidth say together.
+    let each = number(&picture, "bandwidth") / number(&picture, "rate");
+    ensure!(
+        each > 640.0 * 480.0 * 3.0 && each < 640.0 * 480.0 * 3.1,
+        "{picture}"
+    );
+    // Scans have a stamp, the pictures none.
+    let latency = scan["latency"].as_f64().context("a latency")?;
+    ensure!((0.0..30.0).contains(&latency), "{scan}");
+    ensure!(picture.get("latency").is_none(), "{picture}");
+    // Nobody keeps counting behind it.
+    support::until("the place of who counted", || {
+        let graph = scene.rover.calls(
+            "/rosapi/subscribers",
+            json!({"topic": "/sights/image/rgb8"}),
+        )?;
+        let left = graph["values"]["subscribers"]
+            .as_array()
+            .map_or(0, Vec::len);
+        Ok((left == 0).then_some(()).ok_or_else(|| graph.to_string()))
+    })?;
+
+    // A goal of the robot that is reached, one that it cancels, and one of somebody who looks inside.
+    let goal = |id: &str, count: u32| json!({"op": "send_action_goal", "id": id, "action": "/sights/count", "action_type": "actionlib/TestAction", "args": {"goal": count}, "feedback": true});
+    scene.rover.says(goal("short", 1))?;
+    scene
+        .rover
+        .hears("its end", |said| said["op"] == "action_result")?;
+    scene.rover.says(goal("long", 10_000))?;
+    scene.rover.hears("that it has begun", |said| {
+        said["op"] == "action_feedback" && said["id"] == "long"
+    })?;
+    scene
+        .rover
+        .says(json!({"op": "cancel_action_goal", "id": "long", "action": "/sights/count"}))?;
+    scene.rover.hears("its end", |said| {
+        said["op"] == "action_result" && said["id"] == "long"
+    })?;
+    let olga = token(&scene.daemon, &["olga", "--role", "operator"])?;
+    let mut olga = scene.looks(&olga)?;
+    olga.says(goal("hers", 1))?;
+    let hers = olga.hears("its end", |said| said["op"] == "action_result")?;
+    ensure!(hers["result"] == true, "{hers}");
+    let path = format!("/api/v1/servants/{}/goals", scene.servant);
+    let goals = support::until("three goals that have ended", || {
+        let goals = scene.daemon.api(&path)?;
+        let all = goals.as_array().context("a list")?;
+        let ended = all.iter().filter(|goal| goal["ended"].is_u64()).count();
+        Ok((ended == 3)
+            .then(|| all.clone())
+            .ok_or_else(|| goals.to_string()))
+    })?;
+    let told: Vec<_> = goals
+        .iter()
+        .rev()
+        .map(|goal| (goal["by"].clone(), goal["state"].clone()))
+        .collect();
+    ensure!(
+        told == [
+            (json!("robot rover"), json!("succeeded")),
+            (json!("robot rover"), json!("preempted")),
+            (json!("somebody who looks inside"), json!("succeeded")),
+        ],
+        "{goals:?}"
+    );
+    scene
+        .daemon
+        .awaits_event("what became of a goal", |event| {
+            let words = event["message"].as_str().unwrap_or_default();
+            event["kind"] == "goal-ended"
+                && words.contains("/sights/count: the goal of robot rover succeeded")
+        })?;
     scene.daemon.ends()?;
     Ok(())
 }

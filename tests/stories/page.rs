@@ -173,7 +173,10 @@ pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
 }
 
 pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
-    let daemon = daemon("page-inside")?;
+    let daemon = world()
+        .own("page-inside")
+        .config("[black_box]\nseconds = \"10s\"\n")
+        .start()?;
     let admin = token(&daemon, &["admin", "--role", "admin"])?;
     let viewer = token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
     daemon

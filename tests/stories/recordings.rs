@@ -307,3 +307,158 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
     scene.daemon.ends()?;
     Ok(())
 }
+
+pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
+    let config =
+        "[black_box]\nseconds = \"20s\"\ntopics = [\"/sights/scan\", \"/tf*\"]\nfiles = 2\n";
+    let scene = Scene::new("black-box", config)?;
+    let place = world().directory("black-box")?;
+    let types = |words: &[&str]| scene.daemon.deployer().types(words);
+    let listed = |words: &[&str]| -> anyhow::Result<Vec<Value>> {
+        let typed = [&["--format", "json", "recordings", "list"], words].concat();
+        Ok(serde_json::from_str(&types(&typed)?.succeeded()?.stdout)?)
+    };
+    ensure!(listed(&[])?.is_empty(), "nobody has waited yet");
+
+    // It has heard scans for a while.
+    support::until("some seconds in the box", || {
+        let typed = ["--format", "json", "recordings", "take", &scene.servant];
+        let outcome = types(&typed)?;
+        if outcome.status != 0 {
+            return Ok(Err(outcome.said()));
+        }
+        let taken: Value = serde_json::from_str(&outcome.stdout)?;
+        let number = taken[0]["number"].to_string();
+        types(&["recordings", "rm", &number])?.succeeded()?;
+        let enough = taken[0]["seconds"].as_f64() > Some(2.0);
+        Ok(enough.then_some(()).ok_or_else(|| taken.to_string()))
+    })?;
+    // No answer comes in twenty microseconds.
+    let path = format!(
+        "sights_py?token={}&rrt=0.00001&max_rrt=0.00002",
+        scene.token
+    );
+    let mut rover = scene.daemon.robot(&path)?;
+    let written = support::until("a recording", || {
+        rover.calls("/sights/ping", json!({}))?;
+        let all = listed(&["--robot", "rover"])?;
+        Ok(all.first().cloned().ok_or_else(|| "none yet".to_owned()))
+    })?;
+    let why = written["why"].as_str().context("a reason")?;
+    ensure!(
+        why.contains("a request took") && why.contains("its robot accepts"),
+        "{why}"
+    );
+    scene.daemon.awaits_event("that it is recorded", |event| {
+        event["kind"] == "recorded" && event["robot"] == "rover"
+    })?;
+    // Once in a minute, however often it waits.
+    rover.calls("/sights/ping", json!({}))?;
+    ensure!(listed(&[])?.len() == 1, "more than one");
+
+    // It holds what was published before, what was latched long ago, and nothing else.
+    let number = written["number"].to_string();
+    let file = place.path().join("box.mcap");
+    types(&["recordings", "get", &number, "-o", path_str(&file)])?.succeeded()?;
+    let read = reads(&file)?;
+    ensure!(read["messages"] == written["messages"], "{read} {written}");
+    let size = std::fs::metadata(&file)?.len();
+    ensure!(written["bytes"] == size, "{size} bytes: {written}");
+    for topic in ["/tf_static", "/sights/scan", "/tf"] {
+        ensure!(read["topics"].get(topic).is_some(), "{topic}: {read}");
+    }
+    ensure!(
+        read["topics"]
+            .as_object()
+            .is_some_and(|topics| topics.len() == 3),
+        "{read}"
+    );
+    types(&[
+        "replay",
+        path_str(&file),
+        "--to",
+        &scene.servant,
+        "--rate",
+        "100",
+    ])?
+    .succeeded()?;
+
+    // Who sees the service sees it; who operates it takes one when it is wanted.
+    let server = format!("http://{}", scene.daemon.address);
+    let typed_by = |token: &str, words: &[&str]| {
+        types(
+            &[
+                &["--server", &server, "--token", token, "recordings"],
+                words,
+            ]
+            .concat(),
+        )
+    };
+    let eve = scene.viewer("eve", "sights*")?;
+    let stranger = scene.viewer("stranger", "other*")?;
+    let copy = place.path().join("copy.mcap");
+    typed_by(&eve, &["get", &number, "-o", path_str(&copy)])?.succeeded()?;
+    ensure!(
+        std::fs::read(&copy)? == std::fs::read(&file)?,
+        "another file"
+    );
+    for (who, words, status) in [
+        (&eve, &["take", &scene.servant][..], 4),
+        (&eve, &["rm", &number], 4),
+        (&stranger, &["get", &number], 4),
+        (&stranger, &["rm", &number], 4),
+    ] {
+        let refused = typed_by(who, words)?;
+        ensure!(refused.status == status, "{words:?}: {}", refused.status);
+    }
+    let hidden = typed_by(&stranger, &["list"])?.succeeded()?;
+    ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
+    types(&["recordings", "get", "99"])?
+        .failed_saying(&["there is no recording 99", "recordings list"])?;
+
+    // Beyond two files the oldest goes.
+    for _ in 0..2 {
+        types(&["recordings", "take", &scene.servant])?.succeeded()?;
+    }
+    let all = listed(&[])?;
+    ensure!(
+        all.len() == 2 && all.iter().all(|one| one["number"] != written["number"]),
+        "{all:?}"
+    );
+    ensure!(
+        all[0]["why"]
+            .as_str()
+            .is_some_and(|why| why.contains("asked for it")),
+        "{all:?}"
+    );
+    let files = || -> anyhow::Result<usize> {
+        Ok(std::fs::read_dir(scene.daemon.home.join("recordings"))?.count())
+    };
+    ensure!(files()? == 2, "{} files", files()?);
+    let last = all[1]["number"].to_string();
+    types(&["recordings", "rm", &last])?.succeeded()?;
+    ensure!(
+        (listed(&[])?.len(), files()?) == (1, 1),
+        "{} files",
+        files()?
+    );
+
+    // They go with their service: the next of that name may be somebody else's.
+    types(&["rm", "sights_py"])?.succeeded()?;
+    ensure!(
+        (listed(&[])?.len(), files()?) == (0, 0),
+        "{} files",
+        files()?
+    );
+
+    // Where nothing is kept, that is said.
+    scene.daemon.ends()?;
+    let scene = Scene::new("no-black-box", "")?;
+    scene
+        .daemon
+        .deployer()
+        .types(&["recordings", "take", &scene.servant])?
+        .failed_saying(&["nothing of servant", "[black_box]"])?;
+    scene.daemon.ends()?;
+    Ok(())
+}

@@ -117,6 +117,11 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
         Message::text("[]"),
         Message::text(r#"{"op":"launch"}"#),
         Message::text(r#"{"op":"subscribe","subscriptions":[{"id":-1,"channelId":"x"}]}"#),
+        // A message, and a megabyte of it.
+        Message::text(format!(
+            r#"{{"op":"unsubscribe","subscriptionIds":[{}0]}}"#,
+            "0,".repeat(600_000)
+        )),
         Message::binary(Bytes::new()),
         Message::binary(&b"\xffwhat"[..]),
         Message::binary(&b"\x01\x02"[..]),

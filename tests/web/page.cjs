@@ -59,6 +59,21 @@ class Visitor {
     await list.select(value);
   }
 
+  // By the tabulator alone, from where the keyboard is; by the name that a screen reader says.
+  async tabsTo(name) {
+    const there = () => this.page.evaluate((wanted) => {
+      const { activeElement: at } = document;
+      const label = at.labels?.[0]?.innerText ?? '';
+      const named = document.getElementById(at.getAttribute('aria-labelledby'))?.innerText;
+      return [at.getAttribute('aria-label'), named, at.innerText, label].some((text) => text?.trim().startsWith(wanted));
+    }, name);
+    for (let stops = 0; stops < 200; stops += 1) {
+      if (await there()) return;
+      await this.page.keyboard.press('Tab');
+    }
+    assert.fail(`the tabulator does not come to ${name}`);
+  }
+
   opens(hash) {
     return this.page.evaluate((to) => { location.hash = to; }, hash);
   }
@@ -112,6 +127,7 @@ const STEPS = {
     await visitor.judges('servants-empty');
     await visitor.opens('#/nowhere');
     await visitor.sees('There is no such page');
+    await visitor.judges('not-found');
   },
 
   // Two revisions of adder_py: the folder, and an archive of it.
@@ -132,7 +148,8 @@ const STEPS = {
     await visitor.page.waitForSelector('.trouble');
     await visitor.judges('deploy-failed');
     await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
-    await visitor.clicks('Push');
+    await visitor.tabsTo('Push');
+    await visitor.page.keyboard.press('Enter');
     await visitor.sees('Published: adder_py, revision 1');
     await visitor.sees('The interface that was found');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
@@ -185,11 +202,13 @@ const STEPS = {
     await visitor.page.waitForFunction(recorded);
     await visitor.clicks('Explain');
     await visitor.page.waitForFunction(() => document.querySelector('[aria-labelledby=why] [role=status]').innerText.trim() !== '');
-    // By the keyboard: least of all, and one step more.
-    await visitor.page.focus('[role=slider]');
+    // By the keyboard alone: least of all, and one step more.
+    await visitor.page.focus('h1');
+    await visitor.tabsTo('Cores');
     await visitor.page.keyboard.press('Home');
     await visitor.page.keyboard.press('ArrowRight');
-    await visitor.clicks('Set limits');
+    await visitor.tabsTo('Set limits');
+    await visitor.page.keyboard.press('Enter');
     await visitor.sees('In force, as the kernel says: 0.1 cores');
     await visitor.judges('servant');
 
@@ -210,10 +229,15 @@ const STEPS = {
 
     // Back to the revision before.
     await visitor.opens('#/services/adder_py');
-    await visitor.clicks('Use revision 1…');
+    await visitor.sees('Use revision 1…');
+    // By the keyboard alone, and the question is put to it.
+    await visitor.page.focus('h1');
+    await visitor.tabsTo('Use revision 1…');
+    await visitor.page.keyboard.press('Enter');
     await visitor.sees('Make revision 1 the current one?');
     await visitor.judges('confirm');
-    await visitor.clicks('Use it');
+    await visitor.tabsTo('Use it');
+    await visitor.page.keyboard.press('Enter');
     await visitor.sees('Use revision 2…');
     // They were pushed in different ways, and nothing else: the newest beside the one before.
     const differing = await visitor.page.waitForSelector('section[aria-labelledby="differences"] tbody tr');
@@ -445,6 +469,25 @@ const STEPS = {
     await chooses('Service', '/sights/ping');
     await visitor.clicks('Call');
     await visitor.sees('pong');
+    // How much flows on each topic, counted while it is asked for.
+    await visitor.clicks('Count what is published');
+    await page.waitForFunction(() => [...document.querySelectorAll('section[aria-labelledby="topics"] tr')].some((row) => /^\/sights\/scan[^]*\d\sms/.test(row.innerText)));
+    await visitor.judges('inside-counted');
+    await visitor.clicks('Count no more');
+    // What became of the goals, and a recording of the last seconds.
+    await visitor.clicks('Servant', 'link');
+    await visitor.sees('Goals of its actions');
+    await page.waitForFunction(() => ['succeeded', 'cancelled'].every((word) => document.querySelector('section[aria-labelledby="goals"]').innerText.includes(word)));
+    await visitor.sees('somebody who looks inside');
+    await visitor.clicks('Record its last seconds now');
+    await visitor.sees('asked for it');
+    await visitor.judges('servant-goals');
+    const fetched = page.waitForResponse((answer) => answer.url().includes('/api/v1/recordings/'));
+    await visitor.clicks('Download recording 1');
+    assert.strictEqual((await fetched).status(), 200);
+    await visitor.clicks('Remove 1…');
+    await visitor.clicks('Remove it');
+    await visitor.sees('There is none.');
   },
 
   // Settings of Debian's people_detect, where nobody has to say who he is.
@@ -532,6 +575,7 @@ const STEPS = {
     await visitor.sees('No robot is here');
     await visitor.opens('#/services/adder_py');
     await visitor.sees('may not see service adder_py');
+    await visitor.judges('stranger');
   },
 
   // A hundred servants that change each second cost few frames, and an hour of that leaves nothing behind. What the daemon would say
@@ -586,7 +630,7 @@ const STEPS = {
     await page.evaluate(() => clearInterval(window.going));
     console.log(`frames in 5 s: ${idle} of a page that rests, ${busy} of 100 servants that change each second`);
     assert(busy > idle * 0.8, `${busy} frames of 100 servants, ${idle} of a page that rests`);
-    await page.screenshot({ path: `${pictures}/servants-hundred.png`, fullPage: true });
+    await visitor.judges('servants-hundred');
 
     // An hour: half of it is what is kept at the most, the other must add nothing.
     await visitor.opens('#/servants/s1');
@@ -617,6 +661,7 @@ const STEPS = {
     console.log('looks');
     await visitor.sees('was revoked');
     await visitor.sees('With a token');
+    await visitor.judges('revoked');
   },
 
   // A canary is begun by the options that the command line has, and becomes the current revision.

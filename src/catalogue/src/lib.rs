@@ -58,9 +58,41 @@ impl Catalogue {
         }
     }
 
+    /// One revision of a service.
+    ///
+    /// # Errors
+    /// [`Error::UnknownRevision`] with those that there are.
+    pub fn revision(&self, service: &str, number: u64) -> Result<Arc<RevisionRecord>, Error> {
+        match self.state.revision(service, number)? {
+            Some(revision) => Ok(revision),
+            None => {
+                let exists = self.state.revisions(service)?.into_iter();
+                Err(Error::UnknownRevision {
+                    service: service.to_owned(),
+                    revision: number.to_string(),
+                    exists: exists.map(|line| line.number.to_string()).collect(),
+                })
+            }
+        }
+    }
+
     /// The ROS package that a service was first made of.
     pub fn package(&self, service: &str) -> Result<Option<String>, Error> {
         Ok(self.state.service_package(service)?)
+    }
+
+    /// Writes rows of a service's dictionary where it has none; whether it had none.
+    pub fn take_over_rows(
+        &self,
+        service: &str,
+        rows: &api::dictionary::NewRows,
+    ) -> Result<bool, Error> {
+        if !self.state.dictionary(service)?.is_empty() {
+            return Ok(false);
+        }
+        let revision = self.current(service)?.number;
+        self.state.write_dictionary(service, revision, rows)?;
+        Ok(true)
     }
 
     /// Records whose a service is that nobody owns yet.

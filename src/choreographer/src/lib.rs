@@ -55,7 +55,7 @@ use parking_lot::Mutex;
 use reach::{Material, Opener, Pace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
-use tokio::sync::watch;
+use tokio::sync::{broadcast, watch};
 
 pub use decide::Amount;
 pub use decide::admission::{Position, Refused};
@@ -69,6 +69,7 @@ pub use lives::calibration::Requests;
 pub use lives::capture::Bounds;
 pub use lives::handle::Handle;
 pub use lives::lease::Lease;
+pub use lives::recent::Answered;
 pub use lives::rollouts::check_terms;
 pub use lives::waiting::{Admission, Permit, Standing};
 pub use memory::{Memory, MemoryOptions};
@@ -320,6 +321,22 @@ impl Choreographer {
     /// How long requests of robots take.
     pub fn request_times(&self) -> &RequestTimes {
         &self.inner.request_times
+    }
+
+    /// Where what happens is told.
+    pub fn journal(&self) -> &Journal {
+        &self.inner.journal
+    }
+
+    /// Requests of robots that are answered from now on.
+    pub fn answered(&self) -> broadcast::Receiver<Answered> {
+        self.inner.recent.answered()
+    }
+
+    /// The longest that the robot of a servant accepts for a request, in milliseconds; none where it has not said.
+    pub fn accepts(&self, handle: &Handle) -> Option<f64> {
+        let goal = lives::controller::goal(&self.inner, handle)?;
+        goal.bound()
     }
 
     /// Containers of the warm pool, and those of them in which the nodes run.

@@ -18,7 +18,7 @@ pub(crate) mod limits;
 pub(crate) mod measuring;
 mod nodes;
 pub(crate) mod reaching;
-mod recent;
+pub(crate) mod recent;
 pub(crate) mod rollouts;
 pub(crate) mod shadow;
 mod starting;

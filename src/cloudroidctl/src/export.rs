@@ -1,9 +1,8 @@
 //! `export`: a revision's image as one file, which tools of containers read (OCI image specification 1.1, image layout).
 
 use std::collections::BTreeSet;
-use std::fs::File;
 use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use api::ServiceDetail;
@@ -16,14 +15,21 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use crate::client::{Client, empty, escaped};
+use crate::exit::Exit;
 use crate::output::{self, Format};
+use crate::whole::Half;
 
 /// The largest manifest that is read: that of an image of the daemon has some kilobytes.
 const LARGEST_MANIFEST: usize = 16 << 20;
 /// What a tar archive is counted in (POSIX.1-2017, pax interchange format).
 const BLOCK: u64 = 512;
+/// The annotation of the image that names the blob of the service's record, as the daemon reads it.
+const RECORD: &str = "org.cloudroid.record";
 
-/// Write the image of a service into one file: a tar archive of an OCI image layout, which skopeo, umoci and podman read.
+/// Write a service into one file, for another server: `cloudroidctl import FILE` publishes it there.
+///
+/// The file is a tar archive of an OCI image layout, which skopeo, umoci and podman read, too; beside the image it has the service's
+/// interface, how its nodes are started and limited, and its dictionary.
 #[derive(Debug, clap::Args)]
 pub struct Export {
     /// The service.
@@ -83,9 +89,16 @@ impl Export {
             .output
             .unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.service)));
         let half = Half::beside(&target)?;
+        let record = record(client, &self.service, number).await?;
         let name = format!("{}:{number}", self.service);
+        let of = Named {
+            service: &self.service,
+            image: &revision.image,
+            name: &name,
+            record,
+        };
         let mut out = Archive::new(BufWriter::new(&half.file));
-        copy(client, &self.service, &revision.image, &name, &mut out).await?;
+        copy(client, of, &mut out).await?;
         let bytes = out.finish().with_context(|| half.failed())?;
         half.publish()?;
         let exported = Exported {
@@ -108,15 +121,46 @@ impl Export {
     }
 }
 
-/// Writes the image with this digest, named `name`.
-async fn copy(
-    client: &Client,
-    service: &str,
-    image: &str,
-    name: &str,
-    out: &mut Archive<impl Write>,
-) -> anyhow::Result<()> {
+/// What of a revision is not in its image; none for who may not see it.
+async fn record(client: &Client, service: &str, number: u64) -> anyhow::Result<Option<Bytes>> {
     let service = escaped(service);
+    let path = format!("/api/v1/services/{service}/record?revision={number}");
+    let answer = match client.send(Method::GET, &path, empty()).await {
+        Ok(answer) => answer,
+        Err(error) if Exit::of(&error) == Exit::Forbidden => {
+            output::complain(
+                "only the image is exported: how the service is started and limited is shown to who may deploy it; import needs that",
+            );
+            return Ok(None);
+        }
+        Err(error) => return Err(error),
+    };
+    let limited = http_body_util::Limited::new(answer.into_body(), LARGEST_MANIFEST);
+    match limited.collect().await {
+        Ok(collected) => Ok(Some(collected.to_bytes())),
+        Err(error) => bail!("the daemon did not send the record of the service: {error}"),
+    }
+}
+
+/// What is written.
+struct Named<'a> {
+    service: &'a str,
+    /// Digest of the manifest.
+    image: &'a str,
+    /// The image's name in the archive.
+    name: &'a str,
+    record: Option<Bytes>,
+}
+
+/// Writes an image and its record.
+async fn copy(client: &Client, of: Named<'_>, out: &mut Archive<impl Write>) -> anyhow::Result<()> {
+    let Named {
+        image,
+        name,
+        record,
+        ..
+    } = of;
+    let service = escaped(of.service);
     let path = format!("/v2/{service}/manifests/{}", escaped(image));
     let answer = client.send(Method::GET, &path, empty()).await?;
     let limited = http_body_util::Limited::new(answer.into_body(), LARGEST_MANIFEST);
@@ -126,6 +170,15 @@ async fn copy(
     };
     let manifest: Manifest = serde_json::from_slice(&bytes)
         .with_context(|| format!("the manifest {image} cannot be read"))?;
+    let mut annotations = json!({ "org.opencontainers.image.ref.name": name });
+    let record = record.map(|record| {
+        let named = Descriptor {
+            digest: digest_of(&record),
+            size: record.len() as u64,
+        };
+        annotations[RECORD] = named.digest.clone().into();
+        (named, record)
+    });
     let index = json!({
         "schemaVersion": 2,
         "mediaType": "application/vnd.oci.image.index.v1+json",
@@ -133,7 +186,7 @@ async fn copy(
             "mediaType": manifest.media_type,
             "digest": image,
             "size": bytes.len(),
-            "annotations": { "org.opencontainers.image.ref.name": name },
+            "annotations": annotations,
         }],
     });
     out.file("oci-layout", br#"{"imageLayoutVersion":"1.0.0"}"#)?;
@@ -144,6 +197,10 @@ async fn copy(
     };
     out.blob(&named, futures_util::stream::iter([Ok(bytes)]))
         .await?;
+    if let Some((named, record)) = record {
+        out.blob(&named, futures_util::stream::iter([Ok(record)]))
+            .await?;
+    }
     let mut written = BTreeSet::new();
     for blob in std::iter::once(&manifest.config).chain(&manifest.layers) {
         // Layers may be equal.
@@ -167,6 +224,14 @@ async fn copy(
         out.blob(blob, parts).await?;
     }
     Ok(())
+}
+
+fn digest_of(bytes: &[u8]) -> String {
+    format!("sha256:{}", hex_digits(&Sha256::digest(bytes)))
+}
+
+fn hex_digits(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// A tar archive that is written as its content comes.
@@ -213,11 +278,7 @@ impl<W: Write> Archive<W> {
             "the daemon sent {came} of the {} bytes of {digest}",
             named.size
         );
-        let found: String = hash
-            .finalize()
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect();
+        let found = hex_digits(&hash.finalize());
         ensure!(
             found == hex,
             "what the daemon sent for {digest} has the digest sha256:{found}; nothing was written"
@@ -261,46 +322,6 @@ impl<W: Write> Archive<W> {
         self.write(&[0; 2 * BLOCK as usize])?;
         self.out.flush()?;
         Ok(self.bytes)
-    }
-}
-
-/// A file that gets its name when it is whole, and is removed if that does not come.
-struct Half {
-    file: File,
-    path: PathBuf,
-    target: PathBuf,
-}
-
-impl Half {
-    fn beside(target: &Path) -> anyhow::Result<Half> {
-        let Some(name) = target.file_name() else {
-            bail!("{} names no file; give one with -o FILE", target.display());
-        };
-        let part = format!(".{}.{}.part", name.to_string_lossy(), std::process::id());
-        let path = target.with_file_name(part);
-        let file =
-            File::create(&path).with_context(|| format!("cannot write {}", target.display()))?;
-        Ok(Half {
-            file,
-            path,
-            target: target.to_owned(),
-        })
-    }
-
-    fn failed(&self) -> String {
-        format!("cannot write {}", self.target.display())
-    }
-
-    fn publish(&self) -> anyhow::Result<()> {
-        self.file.sync_all().with_context(|| self.failed())?;
-        std::fs::rename(&self.path, &self.target).with_context(|| self.failed())
-    }
-}
-
-impl Drop for Half {
-    fn drop(&mut self) {
-        // It has its own name already, mostly.
-        let _ = std::fs::remove_file(&self.path);
     }
 }
 
@@ -367,20 +388,5 @@ mod tests {
             let refused = written(digest, size, parts).await.expect_err(expected);
             assert!(refused.to_string().contains(expected), "{refused}");
         }
-    }
-
-    #[test]
-    fn a_file_that_is_not_whole_leaves_nothing() {
-        let directory = tempfile::tempdir().expect("a directory");
-        let target = directory.path().join("x.tar");
-        std::fs::write(&target, "earlier").expect("written");
-        drop(Half::beside(&target).expect("begun"));
-        let names = std::fs::read_dir(directory.path()).expect("listed").count();
-        assert_eq!(names, 1);
-        let half = Half::beside(&target).expect("begun");
-        (&half.file).write_all(b"new").expect("written");
-        half.publish().expect("named");
-        drop(half);
-        assert_eq!(std::fs::read(&target).expect("there"), b"new");
     }
 }

@@ -14,6 +14,8 @@ mod exit;
 mod explain;
 mod export;
 mod fit;
+mod goals;
+mod import;
 mod inside;
 mod limits;
 mod logs;
@@ -21,9 +23,10 @@ mod manual;
 mod output;
 mod pair;
 mod policy;
+mod published;
 mod push;
 mod record;
-mod recording;
+mod recordings;
 mod replay;
 mod rm;
 mod rollback;
@@ -41,9 +44,11 @@ mod stub;
 mod terminal;
 mod token;
 mod top;
+mod topics;
 mod trial;
 mod trust;
 mod wait;
+mod whole;
 
 use std::process::ExitCode;
 
@@ -93,6 +98,9 @@ enum Verb {
     Logs(logs::Logs),
     Record(record::Record),
     Replay(replay::Replay),
+    Recordings(recordings::Recordings),
+    Topics(published::Published),
+    Goals(goals::Goals),
     Events(events::Events),
     Set(set::Set),
     Shadow(shadow::Shadow),
@@ -102,6 +110,7 @@ enum Verb {
     Rollback(rollback::Rollback),
     Diff(diff::Diff),
     Export(export::Export),
+    Import(Box<import::Import>),
     Rollout(rollout::Rollout),
     Stub(stub::Stub),
     Try(Box<trial::Try>),
@@ -163,6 +172,9 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Logs(verb) => verb.run(&client, format).await,
         Verb::Record(verb) => verb.run(&client, format).await,
         Verb::Replay(verb) => verb.run(&client, format).await,
+        Verb::Recordings(verb) => verb.run(&client, format).await,
+        Verb::Topics(verb) => verb.run(&client, format).await,
+        Verb::Goals(verb) => verb.run(&client, format).await,
         Verb::Events(verb) => verb.run(&client, format).await,
         Verb::Set(verb) => verb.run(&client, format).await,
         Verb::Shadow(verb) => verb.run(&client, format).await,
@@ -172,6 +184,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Rollback(verb) => verb.run(&client, format).await,
         Verb::Diff(verb) => verb.run(&client, format).await,
         Verb::Export(verb) => verb.run(&client, format).await,
+        Verb::Import(verb) => verb.run(&client, format).await,
         Verb::Rollout(verb) => verb.run(&client, format).await,
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,

@@ -27,7 +27,7 @@ const LONGEST_QUERY: usize = 60_000;
 ///
 /// PATH is a catkin package or workspace (compiled here), a prebuilt install space, or a tar archive of one.
 /// With --apt a packaged ROS package is taken instead.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Default, clap::Args)]
 #[command(group(clap::ArgGroup::new("what").required(true).args(["path", "apt"])))]
 pub struct Push {
     /// A catkin package, workspace or install space, or a tar archive of one.
@@ -138,6 +138,22 @@ fn mapping(text: &str) -> Result<(String, String), String> {
 }
 
 impl Push {
+    /// Of a file that export has written.
+    pub fn of_exported(
+        file: PathBuf,
+        name: Option<String>,
+        rollout: TermFlags,
+        wait: WaitFlag,
+    ) -> Push {
+        Push {
+            path: Some(file),
+            name,
+            rollout,
+            wait,
+            ..Push::default()
+        }
+    }
+
     /// Sends the package, shows what is done with it, and ends with the service's address and interface.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let rolls_out = self.rollout.terms().is_some();

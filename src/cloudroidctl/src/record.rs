@@ -5,17 +5,18 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use foxglove::ws_protocol::client::{Subscribe, Subscription};
 use foxglove::ws_protocol::server::{Channel, ServerMessage};
+use recording::{Summary, Writer};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 
 use crate::client::Client;
 use crate::inside::{self, ENCODING, Inside};
 use crate::output::{self, Format};
-use crate::recording::{Summary, Topics, Writer};
 use crate::token::lifetime;
+use crate::topics::Topics;
 
 /// Messages of a topic that wait in the daemon while the file is written.
 const DEPTH: usize = 1000;
@@ -42,7 +43,8 @@ impl Record {
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let servant = inside::servant(client, &self.servant).await?;
         let inside = Inside::attach(client, &servant, DEPTH).await?;
-        let writer = Writer::create(&self.output)?;
+        let writer = Writer::create(&self.output)
+            .context("-o names another file, which is not there yet")?;
         output::complain(&format!(
             "recording {servant} into {}; Ctrl-C ends it",
             self.output.display()

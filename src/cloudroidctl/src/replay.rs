@@ -10,13 +10,14 @@ use foxglove::ws_protocol::client::{Advertise, MessageData};
 use foxglove::ws_protocol::schema::Schema;
 use foxglove::ws_protocol::server::ServerMessage;
 use foxglove::ws_protocol::server::status::Level;
+use recording::{Played, Reader};
 use tokio::time::{Instant, sleep_until};
 use tokio_tungstenite::tungstenite::Message;
 
 use crate::client::Client;
 use crate::inside::{self, ENCODING, Inside};
 use crate::output::{self, Format};
-use crate::recording::{Played, Reader, Topics};
+use crate::topics::Topics;
 
 /// Messages of a topic that wait for a node that is slow.
 const DEPTH: usize = 1000;
@@ -51,7 +52,13 @@ impl Replay {
     /// Publishes.
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         // Before anybody is asked: what cannot be read is said first.
-        Reader::open(&self.file)?.next()?;
+        if let Err(error) = Reader::open(&self.file).and_then(|mut file| file.next_message()) {
+            let hint = "; cloudroidctl record writes such, and `mcap convert` makes one of a bag";
+            match error {
+                recording::Error::NoRecording { .. } => bail!("{error}{hint}"),
+                error => return Err(error.into()),
+            }
+        }
         let servant = inside::servant(client, &self.to).await?;
         let mut player = Player {
             inside: Inside::attach(client, &servant, DEPTH).await?,
@@ -132,7 +139,7 @@ impl Player {
         let mut reader = Reader::open(&replay.file)?;
         let mut first = None;
         let begun = Instant::now();
-        while let Some(played) = reader.next()? {
+        while let Some(played) = reader.next_message()? {
             if !replay.topics.want(&played.topic) {
                 continue;
             }

@@ -38,7 +38,7 @@ enum Order {
 }
 
 /// On which terms a revision takes another's place.
-#[derive(Debug, Clone, clap::Args)]
+#[derive(Debug, Default, Clone, clap::Args)]
 pub struct TermFlags {
     /// Robots that the revision serves first: 3 for the first three, 10% for a tenth of those that come. It is taken back by
     /// itself when it is worse than the revision before.

@@ -2,6 +2,7 @@
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
 mod acme;
+mod black_box;
 mod class;
 mod doubts;
 mod oidc;
@@ -28,6 +29,7 @@ use crate::machine;
 
 pub use self::oidc::Oidc;
 pub use acme::Acme;
+pub use black_box::BlackBox;
 pub use class::Class;
 pub use people::People;
 pub use time::Time;
@@ -80,6 +82,8 @@ pub struct Config {
     pub portal: Portal,
     /// Limits of memory outside of servants' containers.
     pub memory: Memory,
+    /// What of servants is kept for when something goes wrong.
+    pub black_box: BlackBox,
     /// Limits of pushes.
     pub push: Push,
     /// What pushes may ask for beyond a container.
@@ -294,6 +298,7 @@ impl Default for Config {
             oidc: None,
             portal: Portal::default(),
             memory: Memory::default(),
+            black_box: BlackBox::default(),
             push: Push::default(),
             allow: Allow::default(),
         }
@@ -501,6 +506,9 @@ impl Config {
         }
         reach::egress::check(&self.allow.egress)
             .context("egress in [allow] of the configuration")?;
+        self.black_box
+            .check(self.memory.servant)
+            .context("[black_box] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
         self.capacity
             .check()

@@ -1,7 +1,7 @@
 //! The state directory: where everything of one daemon is, and the lock that makes it one.
 //!
 //! ```text
-//! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/
+//! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/  recordings/
 //! ```
 //!
 //! Nobody else enters it (docs/adr/033).

@@ -256,6 +256,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         None,
     ));
     let history = tokio::spawn(portal::keep_history(Arc::clone(&app)));
+    let observers = tokio::spawn(portal::keep_observers(Arc::clone(&app)));
     let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
     if let Some((certificate, key)) = config.tls.files() {
         // The key is root's.
@@ -288,7 +289,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     supervision::stopping();
     wiring::drain(&app, config.keeps_servants()).await;
     app.ending.cancel();
-    let _ = tokio::join!(tcp, unix, members, history);
+    let _ = tokio::join!(tcp, unix, members, history, observers);
     let _ = std::fs::remove_file(home.socket());
     Ok(())
 }

@@ -102,6 +102,7 @@ pub fn build(
         machine,
         live: portal::Live::default(),
         inside: portal::Lookers::default(),
+        observers: portal::Observers::default(),
         started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),

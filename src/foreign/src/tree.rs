@@ -141,31 +141,52 @@ impl Tree {
         self.open_and_read(path.as_ref(), limit, resolve)
     }
 
+    /// The regular file at `path` in it, opened for reading; none when nothing has the name.
+    ///
+    /// # Errors
+    /// As [`Tree::file`].
+    pub fn open_file(&self, path: impl AsRef<Path>) -> Result<Option<OwnedFd>, Error> {
+        let path = path.as_ref();
+        let Some(file) = self.opened(path, INSIDE)? else {
+            return Ok(None);
+        };
+        let shown = self.path.join(path);
+        let stat =
+            rustix::fs::fstat(&file).map_err(|error| Error::file("look at", &shown, error))?;
+        match FileType::from_raw_mode(stat.st_mode) {
+            FileType::RegularFile => Ok(Some(file)),
+            _ => Err(Error::NotAFile { path: shown }),
+        }
+    }
+
     fn open_and_read(
         &self,
         path: &Path,
         limit: u64,
         resolve: ResolveFlags,
     ) -> Result<Option<File>, Error> {
+        let file = self.opened(path, resolve)?;
+        file.map(|file| read(file, &self.path.join(path), limit))
+            .transpose()
+    }
+
+    fn opened(&self, path: &Path, resolve: ResolveFlags) -> Result<Option<OwnedFd>, Error> {
         let shown = self.path.join(path);
         let flags = if resolve.contains(ResolveFlags::NO_SYMLINKS) {
             FILE
         } else {
             FILE.difference(OFlags::NOFOLLOW)
         };
-        let file = match rustix::fs::openat2(&self.directory, path, flags, Mode::empty(), resolve) {
-            Ok(file) => file,
-            Err(Errno::NOENT) => return Ok(None),
-            Err(Errno::XDEV) => {
-                return Err(Error::Outside {
-                    path: shown,
-                    root: self.path.clone(),
-                });
-            }
-            Err(error) if is_something_else(error) => return Err(Error::NotAFile { path: shown }),
-            Err(error) => return Err(Error::file("open", &shown, error)),
-        };
-        read(file, &shown, limit).map(Some)
+        match rustix::fs::openat2(&self.directory, path, flags, Mode::empty(), resolve) {
+            Ok(file) => Ok(Some(file)),
+            Err(Errno::NOENT) => Ok(None),
+            Err(Errno::XDEV) => Err(Error::Outside {
+                path: shown,
+                root: self.path.clone(),
+            }),
+            Err(error) if is_something_else(error) => Err(Error::NotAFile { path: shown }),
+            Err(error) => Err(Error::file("open", &shown, error)),
+        }
     }
 }
 

@@ -59,6 +59,12 @@ pub enum Error {
         /// What was given.
         name: String,
     },
+    /// What was sent is no image that can be taken in.
+    #[error("the image cannot be taken in: {problem}")]
+    Unreceivable {
+        /// What is wrong.
+        problem: String,
+    },
     /// A layer that is not in the store.
     #[error("layer {diff_id} is not in the store at {}; push the package again", .store.display())]
     UnknownLayer {

@@ -26,6 +26,24 @@ pub struct ImageSpec {
     pub annotations: BTreeMap<String, String>,
 }
 
+impl ImageSpec {
+    /// What configuration and manifest say, of these layers.
+    pub(crate) fn read(layers: Vec<LayerInfo>, config: Config, manifest: oci::Manifest) -> Self {
+        let process = config.config;
+        let env = process.env.iter().filter_map(|pair| pair.split_once('='));
+        ImageSpec {
+            layers,
+            env: env
+                .map(|(name, value)| (name.to_owned(), value.to_owned()))
+                .collect(),
+            cmd: process.cmd,
+            working_dir: process.working_dir,
+            labels: process.labels,
+            annotations: manifest.annotations,
+        }
+    }
+}
+
 /// An image of the store, read back.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Image {
@@ -104,23 +122,9 @@ impl Store {
                 })
             })
             .collect::<Result<_, Error>>()?;
-        let env = config
-            .config
-            .env
-            .iter()
-            .filter_map(|pair| pair.split_once('='));
         Ok(Image {
             digest: *image,
-            spec: ImageSpec {
-                layers,
-                env: env
-                    .map(|(name, value)| (name.to_owned(), value.to_owned()))
-                    .collect(),
-                cmd: config.config.cmd,
-                working_dir: config.config.working_dir,
-                labels: config.config.labels,
-                annotations: manifest.annotations,
-            },
+            spec: ImageSpec::read(layers, config, manifest),
         })
     }
 

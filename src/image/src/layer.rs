@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::digest::Hashing;
+use crate::entry::shown;
 use crate::files::{self, NewFile};
 use crate::gzip::{self, Failed};
 use crate::store::{MAX_DOCUMENT, json};
+use crate::tar_reader::TarReader;
 use crate::tar_writer::TarWriter;
 use crate::tree::Packer;
-use crate::{Digest, Error, Refusal, Store};
+use crate::{Digest, Error, Limits, Refusal, Store};
 
 /// A layer in the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -103,8 +105,44 @@ impl Store {
 
     /// Copies a `tar.gz` into the store as a layer. Its digest and diff-id are found on the way.
     pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
-        let _hold = self.hold()?;
         let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
+        self.copy_layer(file, archive, |copy| {
+            gunzip_and_hash(copy).map_err(|error| match error.kind() {
+                io::ErrorKind::UnexpectedEof
+                | io::ErrorKind::InvalidInput
+                | io::ErrorKind::InvalidData => malformed(archive, error),
+                _ => Error::file("read", archive, error),
+            })
+        })
+    }
+
+    /// The same of a file that strangers have written, called `label`, which may not hold more than `limits`; gives the number of its
+    /// entries, too.
+    pub(crate) fn import_layer_within(
+        &self,
+        file: File,
+        label: &Path,
+        limits: &Limits,
+    ) -> Result<(LayerInfo, u64), Error> {
+        let mut entries = 0;
+        let layer = self.copy_layer(file, label, |copy| {
+            let content = gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
+            let (digest, bytes, counted) =
+                gzip::reading_ahead(content, |content| walk(content, label, limits))?;
+            entries = counted;
+            Ok((digest, bytes))
+        })?;
+        Ok((layer, entries))
+    }
+
+    /// Copies what `read` reads, which finds the digest and the bytes of the content.
+    fn copy_layer(
+        &self,
+        file: File,
+        archive: &Path,
+        read: impl FnOnce(&mut Tee<File, Hashing<&NewFile>>) -> Result<(Digest, u64), Error>,
+    ) -> Result<LayerInfo, Error> {
+        let _hold = self.hold()?;
         let needed = file.metadata().map_or(0, |metadata| metadata.len());
         check_gzip(&file, archive)?;
         let blob = self.new_blob()?;
@@ -113,16 +151,11 @@ impl Store {
             to: Hashing::new(&blob),
             failed: None,
         };
-        let read = gunzip_and_hash(&mut copy);
+        let read = read(&mut copy);
         if let Some(error) = copy.failed.take() {
             return Err(Error::file("write a layer to", self.images_dir(), error).needing(needed));
         }
-        let (diff_id, unpacked) = read.map_err(|error| match error.kind() {
-            io::ErrorKind::UnexpectedEof
-            | io::ErrorKind::InvalidInput
-            | io::ErrorKind::InvalidData => malformed(archive, error),
-            _ => Error::file("read", archive, error),
-        })?;
+        let (diff_id, unpacked) = read?;
         let (_, digest, size) = copy.to.finish();
         let layer = LayerInfo {
             digest,
@@ -225,6 +258,54 @@ pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, 
         let (_, diff_id, bytes) = content.finish();
         Ok((diff_id, bytes))
     })
+}
+
+/// The same of the content of a layer that strangers have written, with the number of its entries.
+fn walk(
+    content: &mut dyn Read,
+    label: &Path,
+    limits: &Limits,
+) -> Result<(Digest, u64, u64), Error> {
+    let refused = |problem| Error::Archive {
+        archive: label.display().to_string(),
+        problem,
+    };
+    let most = limits.bytes.saturating_add(1);
+    let mut reader = TarReader::new(Hashing::new(content.take(most)));
+    let mut entries = 0;
+    let mut last = String::new();
+    let walked = loop {
+        match reader.next_entry() {
+            Ok(None) => break Ok(()),
+            Ok(Some(entry)) => {
+                entries += 1;
+                last = shown(&entry.name);
+                if entries > limits.entries {
+                    return Err(refused(Refusal::TooManyEntries {
+                        entry: last,
+                        limit: limits.entries,
+                    }));
+                }
+            }
+            Err(stop) => break Err(Error::stopped(&label.display().to_string(), label, stop)),
+        }
+    };
+    let mut rest = reader.into_inner();
+    // What follows the end mark counts for the digest.
+    let read = match walked.is_ok() {
+        true => io::copy(&mut rest, &mut io::sink()),
+        false => Ok(0),
+    };
+    let (_, digest, bytes) = rest.finish();
+    if bytes > limits.bytes {
+        return Err(refused(Refusal::TooLarge {
+            entry: last,
+            limit: limits.bytes,
+        }));
+    }
+    walked?;
+    read.map_err(|error| malformed(label, error))?;
+    Ok((digest, bytes, entries))
 }
 
 /// The media type promises gzip, so nothing else is let in.

@@ -4,7 +4,7 @@
 //! ```text
 //!   tree ──layer_from_tree──▶ blobs/sha256/<digest> ──extracted──▶ layers/<diff-id>/  (shared, read-only)
 //!     │  ╰───────────stage_tree──────────────────────────────────▲   (the tree at once, the blob later)
-//!   tar.gz ──import_layer───▶        ▲
+//!   tar.gz ──import_layer───▶        ▲   (a whole image of another store: receive)
 //!                          put_image ┴ tag ──▶ index.json      gc: what no tag and no caller keeps, goes
 //!   upload ──unpack──▶ directory     (refuses whatever could leave it)
 //! ```
@@ -31,6 +31,7 @@ mod layer_writer;
 mod names;
 pub mod oci;
 mod pipe;
+mod received;
 mod refusal;
 mod store;
 mod tar_reader;
@@ -44,6 +45,7 @@ pub use files::write_whole;
 pub use gc::{Damage, Swept};
 pub use images::{Image, ImageSpec, Manifest};
 pub use layer::{LayerInfo, Mtime, TreeOptions};
+pub use received::{Received, document, is_layout};
 pub use refusal::Refusal;
 pub use store::{Blob, Hold, Store};
 pub use unpack::{Limits, Unpacked, unpack};

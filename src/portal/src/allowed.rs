@@ -17,7 +17,7 @@ use crate::audit::{About, is_recorded};
 use crate::errors::Error;
 use crate::guard::Caller;
 use crate::routes::{Access, Of, Route};
-use crate::stubs;
+use crate::{recordings, stubs};
 
 /// The class of robots that name none.
 const DEFAULT: &str = "default";
@@ -59,6 +59,9 @@ pub async fn allowed(
         Of::Servant(parameter) => {
             at_servant(&app, caller, action, named(parameter).unwrap_or_default())
         }
+        Of::Recording(parameter) => {
+            at_recording(&app, caller, action, named(parameter).unwrap_or_default())
+        }
         Of::Robot(parameter) => at_robot(
             &caller.who.principal,
             action,
@@ -73,6 +76,9 @@ pub async fn allowed(
         Of::Stub(parameter) => format!("stub {}", named(parameter).unwrap_or_default()),
         Of::Servant(parameter) => format!("servant {}", named(parameter).unwrap_or_default()),
         Of::Robot(parameter) => format!("robot {}", named(parameter).unwrap_or_default()),
+        Of::Recording(parameter) => {
+            format!("recording {}", named(parameter).unwrap_or_default())
+        }
     };
     let about = About::default();
     request.extensions_mut().insert(about.clone());
@@ -126,6 +132,11 @@ impl Caller {
         let principal = &self.who.principal;
         let own = principal.scope.robot.as_deref();
         !principal.is(Role::Robot) || own.is_none_or(|own| own == robot)
+    }
+
+    /// Whether it may do something to what is of a robot at a service: robots may to their own alone.
+    pub fn may_of(&self, app: &App, action: Action, service: &str, robot: &str) -> bool {
+        self.is_robot_of(robot) && self.may_at(app, action, service, None).is_ok()
     }
 
     /// Whether it may do something at a service, as a robot where one is named.
@@ -182,20 +193,35 @@ pub fn known_to(app: &App, caller: &Caller, service: &str) -> Result<(), Error> 
 }
 
 fn at_servant(app: &App, caller: &Caller, action: Action, id: &str) -> Result<(), Error> {
+    let handle = app.choreographer.servant(id);
+    let may = handle.map(|handle| caller.may_of(app, action, handle.service(), &handle.robot));
+    hidden(
+        caller,
+        action,
+        may.map_err(Error::from),
+        format_args!("servant {id}"),
+    )
+}
+
+fn at_recording(app: &App, caller: &Caller, action: Action, number: &str) -> Result<(), Error> {
+    let known = recordings::known(app, number);
+    let may = known.map(|known| caller.may_of(app, action, &known.service, &known.robot));
+    hidden(caller, action, may, format_args!("recording {number}"))
+}
+
+/// Refuses what is not there as what somebody may not see: whether it is there is told to those alone who are told of all.
+fn hidden(
+    caller: &Caller,
+    action: Action,
+    may: Result<bool, Error>,
+    object: std::fmt::Arguments<'_>,
+) -> Result<(), Error> {
     let principal = &caller.who.principal;
-    let may = match app.choreographer.servant(id) {
-        Ok(handle) => {
-            caller.is_robot_of(&handle.robot)
-                && caller.may_at(app, action, handle.service(), None).is_ok()
-        }
-        // Whether it is there is told to those alone who are told of all.
-        Err(error) if principal.is_unscoped() => return Err(error.into()),
-        Err(error) if principal.sees_all() && action == Action::See => return Err(error.into()),
-        Err(_) => false,
-    };
     match may {
-        true => Ok(()),
-        false => Err(access::Refusal::new(principal, action, format_args!("servant {id}")).into()),
+        Ok(true) => Ok(()),
+        Err(error) if principal.is_unscoped() => Err(error),
+        Err(error) if principal.sees_all() && action == Action::See => Err(error),
+        _ => Err(access::Refusal::new(principal, action, object).into()),
     }
 }
 

@@ -23,7 +23,7 @@ use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
 use crate::query::Query;
-use crate::views;
+use crate::{recordings, views};
 
 pub(super) type Answer<T> = Result<Json<T>, Error>;
 
@@ -90,15 +90,38 @@ pub async fn interface(
     Ok(Json(app.catalogue.current(&name)?.interface.clone()))
 }
 
+/// Which revision.
+#[derive(Debug, Deserialize, IntoParams)]
+pub struct OfRevision {
+    /// Its number; that of the current one by default.
+    revision: Option<u64>,
+}
+
+/// What of a revision is not in its image.
+pub async fn record(
+    State(app): State<Arc<App>>,
+    Path(name): Path<String>,
+    Query(of): Query<OfRevision>,
+) -> Answer<push::ServiceRecord> {
+    let current = app.catalogue.current(&name)?;
+    let revision = match of.revision {
+        Some(number) => app.catalogue.revision(&name, number)?,
+        None => current,
+    };
+    let rows = app.state.dictionary(&name)?;
+    Ok(Json(push::ServiceRecord::of(&revision, rows)))
+}
+
 /// Removes a service, its servants and its images.
 pub async fn remove_service(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> Answer<Stopped> {
     app.catalogue.current(&name)?;
-    Ok(Json(Stopped {
-        stopped: app.pusher.remove(&name).await?,
-    }))
+    let stopped = app.pusher.remove(&name).await?;
+    // The next of this name may be somebody else's.
+    recordings::forget_service(&app, &name).await?;
+    Ok(Json(Stopped { stopped }))
 }
 
 /// Makes an earlier revision the current one.

@@ -14,6 +14,7 @@ use tokio_util::task::TaskTracker;
 use crate::audit::Audit;
 use crate::handshakes::Handshakes;
 use crate::inside::Lookers;
+use crate::observers::{BlackBoxOptions, Observers};
 use crate::people::passwords::Passwords;
 use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
@@ -38,6 +39,8 @@ pub struct Options {
     pub drain: Duration,
     /// What is done on a machine that cannot set limits, as the configuration names it.
     pub isolation: String,
+    /// What of servants is kept for when something goes wrong.
+    pub black_box: BlackBoxOptions,
 }
 
 /// What the daemon keeps of its first look at the machine.
@@ -91,6 +94,8 @@ pub struct App {
     pub live: Live,
     /// Who looks into servants.
     pub inside: Lookers,
+    /// Who hears servants beside their robots.
+    pub observers: Observers,
     /// When the daemon started.
     pub started: Millis,
     /// Sessions under way.

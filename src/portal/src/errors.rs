@@ -151,6 +151,20 @@ pub enum Error {
     /// A servant's ROS is not there yet, or not any more.
     #[error("nobody can look into servant {0}: it is starting, or ending")]
     NotThereYet(String),
+    /// No black box listens to the servant.
+    #[error("nothing of servant {0} is kept")]
+    NoBlackBox(String),
+    /// No such file.
+    #[error("there is no recording {0}")]
+    UnknownRecording(String),
+    /// A file of a servant's last seconds is not written.
+    #[error("the last seconds of servant {servant} are not recorded: {reason}")]
+    NotRecorded {
+        /// Whose.
+        servant: String,
+        /// Why.
+        reason: String,
+    },
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
@@ -384,6 +398,9 @@ impl Error {
                 "too many look inside",
             ),
             Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not there yet"),
+            Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "nothing is kept"),
+            Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
+            Error::NotRecorded { .. } => (S::INSUFFICIENT_STORAGE, "not-recorded", "not recorded"),
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
                 (S::SERVICE_UNAVAILABLE, "busy", "too many sign in")
             }
@@ -453,6 +470,13 @@ impl Error {
             }
             Error::NotThereYet(id) => {
                 format!("see its state with: cloudroidctl servants, or GET /api/v1/servants/{id}; try again when it is ready")
+            }
+            Error::NoBlackBox(_) => {
+                "have an operator set seconds of [black_box] in the configuration (docs/viewers.md); where it is set, a servant is listened to a second after it is ready".into()
+            }
+            Error::UnknownRecording(_) => "see those that exist with: cloudroidctl recordings list".into(),
+            Error::NotRecorded { .. } => {
+                "make room on the disk of the state directory, or lower disk of [black_box] in the configuration; then: cloudroidctl recordings take SERVANT".into()
             }
             Error::NoProvider => "sign in with an account, or have [oidc] configured (docs/access.md)".into(),
             Error::Provider(error) => error.next().into(),

@@ -50,7 +50,7 @@ pub struct Place {
 }
 
 impl Lookers {
-    fn place(&self, servant: &str, who: &str) -> Result<Place, Error> {
+    pub(crate) fn place(&self, servant: &str, who: &str) -> Result<Place, Error> {
         let mut all = self.all.lock();
         let there = all.entry(servant.to_owned()).or_default();
         let own = there.iter().filter(|other| *other == who).count();

@@ -86,6 +86,14 @@ impl Operation {
         self.answer("200", "As asked.", JSON, object.into())
     }
 
+    /// It answers a file of this media type.
+    pub fn answers_file(self, media: &str) -> Self {
+        let file = ObjectBuilder::new()
+            .schema_type(Type::String)
+            .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
+        self.answer("200", "As asked.", media, file.into())
+    }
+
     /// It sends a browser elsewhere.
     pub fn leads_on(mut self) -> Self {
         let response = ResponseBuilder::new().description("Elsewhere, by Location.");

@@ -15,8 +15,9 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, differences, events, history, inside, machines,
-    metrics, oci, openapi, page, people, policy, push, robots, shadow, stream, stubs, viewers,
+    App, api_v1, audit, calibration, dictionary, differences, events, goals, history, inside,
+    machines, metrics, oci, openapi, page, people, policy, push, recordings, robots, shadow,
+    stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -51,6 +52,8 @@ pub enum Of {
     Servant(&'static str),
     /// A robot.
     Robot(&'static str),
+    /// The service and the robot of a recording.
+    Recording(&'static str),
     /// What the query or the body names: the handler decides.
     Handler,
 }
@@ -112,7 +115,14 @@ const fn at(
 
 /// Whether what is to be looked up is in the address. Where it is not, the program does not compile.
 const fn names_its_object(path: &str, access: Access) -> bool {
-    let May(_, Of::Service(name) | Of::Stub(name) | Of::Servant(name) | Of::Robot(name)) = access
+    let May(
+        _,
+        Of::Service(name)
+        | Of::Stub(name)
+        | Of::Servant(name)
+        | Of::Robot(name)
+        | Of::Recording(name),
+    ) = access
     else {
         return true;
     };
@@ -233,7 +243,7 @@ pub const ROUTES: &[Route] = &[
     .described(|| {
         operation(
             "removeService",
-            "Removes the service, its servants and its images.",
+            "Removes the service, its servants, its images and its recordings.",
         )
         .answers::<api::Stopped>()
     }),
@@ -241,6 +251,17 @@ pub const ROUTES: &[Route] = &[
         get(api_v1::interface)
     })
     .described(|| operation("interface", "The interface with all definitions.").answers_object()),
+    at("GET", "/api/v1/services/{name}/record", service(Deploy), || {
+        get(api_v1::record)
+    })
+    .described(|| {
+        operation(
+            "serviceRecord",
+            "What of a revision is not in its image, for another server to publish both.",
+        )
+        .asks::<api_v1::OfRevision>()
+        .answers_object()
+    }),
     at("GET", "/api/v1/services/{name}/differences", service(See), || {
         get(differences::differences)
     })
@@ -413,6 +434,48 @@ pub const ROUTES: &[Route] = &[
     .described(|| {
         operation("inside", "Looks into a servant: a WebSocket that speaks rosbridge beside its robot.")
             .becomes_a_websocket()
+    }),
+    at("GET", "/api/v1/servants/{id}/topics", servant(See), || {
+        get(topics::topics)
+    })
+    .described(|| {
+        operation(
+            "topics",
+            "What is published on each topic of a servant: a line each second. To count it, all of it is heard beside its robot.",
+        )
+        .streams::<api::topics::PublishedTopics>()
+    }),
+    at("GET", "/api/v1/servants/{id}/goals", servant(See), || {
+        get(goals::goals)
+    })
+    .described(|| {
+        operation("goals", "What became of the goals of a servant's actions, the newest first.")
+            .lists::<api::goals::Goal>()
+    }),
+    at("POST", "/api/v1/servants/{id}/recording", servant(Operate), || {
+        post(recordings::take)
+    })
+    .described(|| {
+        operation("takeRecording", "Writes a file of what flowed in a servant in the last seconds.")
+            .answers::<api::recordings::Recording>()
+    }),
+    at("GET", "/api/v1/recordings", ENTER, || get(recordings::list)).described(|| {
+        operation("recordings", "Files of the last seconds of servants, the newest first.")
+            .asks::<recordings::Which>()
+            .lists::<api::recordings::Recording>()
+    }),
+    at("GET", "/api/v1/recordings/{number}", May(See, Of::Recording("number")), || {
+        get(recordings::file)
+    })
+    .described(|| {
+        operation("recording", "Such a file (MCAP).").answers_file("application/octet-stream")
+    }),
+    at("DELETE", "/api/v1/recordings/{number}", May(Operate, Of::Recording("number")), || {
+        delete(recordings::remove)
+    })
+    .described(|| {
+        operation("removeRecording", "Removes such a file; gives those that are left.")
+            .lists::<api::recordings::Recording>()
     }),
     at("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).described(|| {
         operation(

@@ -13,6 +13,7 @@
 
 mod bounds;
 mod error;
+mod exported;
 mod interface_limits;
 mod naming;
 mod options;
@@ -42,11 +43,13 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use bounds::Left;
+use exported::Imported;
 use places::Places;
 use request::Reporter;
 use store::{Journal, NewEvent, Plan, RevisionRecord};
 
 pub use error::Error;
+pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
 pub use request::{Deployer, Published};
@@ -153,7 +156,21 @@ impl Pusher {
         let known = options.name.as_deref().or(options.apt.as_deref());
         let mut admitted = self.places.enter(known, report).await?;
         let mut left = Left::new(&self.options, self.home.join("build").join(id));
-        let built = left.during(self.made(id, options, archive, report)).await?;
+        let made = left.during(self.made(id, options, archive, report)).await?;
+        let (built, imported) = match made {
+            Made::Built(built) => (*built, None),
+            Made::Imported(imported) => {
+                let Imported {
+                    record,
+                    options,
+                    built,
+                } = *imported;
+                // Another server allowed it; this one may not.
+                self.check(&options, by)?;
+                (built, Some((record, options)))
+            }
+        };
+        let options = imported.as_ref().map_or(options, |(_, options)| options);
         let name = options
             .name
             .clone()
@@ -163,8 +180,15 @@ impl Pusher {
         // Pushes of one service follow one another: whose it is does not change until this one is done.
         by.may(&name)?;
         let is_new = self.catalogue.package(&name)?.is_none();
-        let shown = self.shown(id, options, built, (name.clone(), by), report);
+        let mut plan = plan_of(&built, options);
+        if let Some((record, _)) = &imported {
+            plan.restart = record.plan.restart;
+        }
+        let shown = self.shown(id, options, (built, plan), (name.clone(), by), report);
         let layers = left.during(shown).await?;
+        if let Some((record, _)) = &imported {
+            self.take_over_rows(&name, record, report).await?;
+        }
         if let Some(owner) = by.owner.as_deref().filter(|_| is_new) {
             self.catalogue.own(&name, owner)?;
         }
@@ -182,7 +206,7 @@ impl Pusher {
         options: &PushOptions,
         archive: Archive,
         report: &Reporter,
-    ) -> Result<BuildOutcome, Error> {
+    ) -> Result<Made, Error> {
         let source = match &options.apt {
             Some(package) => {
                 // Names of Debian packages have hyphens, those of ROS packages do not.
@@ -195,6 +219,13 @@ impl Pusher {
                 report.step("receiving the package").await;
                 let tree = self.home.join("build").join(id).join(PUSHED);
                 receive::unpack(archive, &tree, &self.options, report).await?;
+                let of = tree.clone();
+                if privilege::blocking(move || exported::is_exported(&of))
+                    .await
+                    .unwrap_or(false)
+                {
+                    return self.taken_in(options, tree, report).await;
+                }
                 if let Some(name) = &options.name {
                     let of = tree.clone();
                     let look = move || privilege::reading(|| receive::packages_of(&of));
@@ -206,7 +237,9 @@ impl Pusher {
                 Source::Tree(tree)
             }
         };
-        self.build(id, options, source, report).await
+        self.build(id, options, source, report)
+            .await
+            .map(|built| Made::Built(Box::new(built)))
     }
 
     /// Finds the interface of an image, and publishes both; gives the image's layers.
@@ -214,13 +247,12 @@ impl Pusher {
         &self,
         id: &str,
         options: &PushOptions,
-        built: BuildOutcome,
+        (built, mut plan): (BuildOutcome, Plan),
         (name, by): (String, &Deployer),
         report: &Reporter,
     ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         report.step("starting it once to find its interface").await;
-        let mut plan = plan_of(&built, options);
         for warning in self.choreographer.check_grants(&plan.grants)? {
             report.warning(warning).await;
         }
@@ -322,6 +354,12 @@ impl Pusher {
         let (built, ()) = tokio::join!(work, forwarded);
         built.map_err(|error| push_error(&error, &self.home, &options.source))
     }
+}
+
+/// What is published, before it was started once.
+enum Made {
+    Built(Box<BuildOutcome>),
+    Imported(Box<Imported>),
 }
 
 fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {

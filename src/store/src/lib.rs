@@ -16,6 +16,7 @@ mod pairings;
 mod people;
 pub mod private;
 mod provided;
+mod recordings;
 mod robots;
 mod rollouts;
 mod rules;
@@ -42,6 +43,7 @@ pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
 pub use people::{AccountRecord, NewSession, SessionRecord};
 pub use provided::ProvidedRecord;
+pub use recordings::RecordingRecord;
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
@@ -49,7 +51,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 12] = [
+const MIGRATIONS: [&str; 13] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -62,6 +64,7 @@ const MIGRATIONS: [&str; 12] = [
     include_str!("010-people.sql"),
     include_str!("011-provided.sql"),
     include_str!("012-history.sql"),
+    include_str!("013-recordings.sql"),
 ];
 
 /// What can go wrong.

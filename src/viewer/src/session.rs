@@ -42,6 +42,8 @@ pub const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 /// How messages are written, and how their definitions are.
 const ENCODING: &str = "ros1";
 const SCHEMA: &str = "ros1msg";
+/// Bytes of a message in JSON: many small things, of which each may have an answer. Publications are binary.
+const LARGEST_TEXT: usize = 1 << 20;
 /// What waits to be sent, in messages; a viewer that reads slowly misses what comes meanwhile.
 const OUTGOING: usize = 16;
 /// Messages of a topic that may wait behind these, as the viewer asks; the newest win.
@@ -396,6 +398,12 @@ impl Session {
     }
 
     async fn take(&mut self, is_text: bool, message: &[u8]) {
+        if is_text && message.len() > LARGEST_TEXT {
+            return self.complain(format!(
+                "this message has {} bytes of JSON, and {LARGEST_TEXT} are read at most",
+                message.len()
+            ));
+        }
         let message = match is_text {
             true => std::str::from_utf8(message)
                 .map_err(|error| error.to_string())

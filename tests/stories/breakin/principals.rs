@@ -103,6 +103,8 @@ fn changes<'a>(service: &str, servant: &str) -> Vec<Attempt<'a>> {
         Attempt::new("GET", servant("/logs"), NO),
         Attempt::new("GET", servant("/logs?follow=true"), NO),
         Attempt::new("HEAD", servant("/logs"), NO),
+        Attempt::new("POST", servant("/recording"), NO),
+        Attempt::new("GET", of("/record"), NO),
         Attempt::new("PATCH", servant(""), NO).body(json!({"cpus": 0.01})),
         Attempt::new("DELETE", servant(""), NO),
         Attempt::new("DELETE", format!("/api/v1/servants?service={service}"), NO),
@@ -146,6 +148,8 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
         format!("/{service}/"),
         format!("/api/v1/servants/{servant}"),
         format!("/api/v1/servants/{servant}/inside"),
+        format!("/api/v1/servants/{servant}/topics"),
+        format!("/api/v1/servants/{servant}/goals"),
         format!("/foxglove/{servant}"),
     ] {
         attempts.push(Attempt::new("HEAD", path.clone(), NO));

@@ -252,3 +252,12 @@ export interface MachineHistory {
   step: number;
   figures: Figures<'cores' | 'promised' | 'memory' | 'cpu_waits' | 'memory_waits' | 'io_waits'>;
 }
+
+/** A file of the last seconds of a servant. */
+export interface Recording { number: number; service: string; robot: string; servant: string; time: number; why: string; seconds: number; messages: number; bytes: number }
+
+/** A goal of an action that a servant was sent. */
+export interface Goal { action: string; id: string; by: string; began: number; ended?: number; state: 'underway' | 'preempted' | 'succeeded' | 'aborted' | 'rejected' | 'recalled' | 'lost'; text?: string }
+
+/** What was published on a topic in a second; latency in seconds. */
+export interface TopicFigures { topic: string; type: string; rate: number; bandwidth: number; latency?: number }

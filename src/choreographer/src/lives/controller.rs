@@ -299,7 +299,7 @@ impl Looked {
 }
 
 /// What its robot accepts: the strictest of what was stated before it was admitted, else its class's.
-pub(super) fn goal(inner: &Inner, handle: &Handle) -> Option<Goal> {
+pub(crate) fn goal(inner: &Inner, handle: &Handle) -> Option<Goal> {
     let terms = handle.terms();
     let stated = terms.stated.values();
     let mut slas: Vec<api::Sla> = stated.clone().map(|stated| stated.sla).collect();

@@ -2,11 +2,13 @@
 //! of a service.)
 
 use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use api::ResponseTimes;
 use parking_lot::Mutex;
 use qos::nearest_rank;
+use tokio::sync::broadcast;
 
 use crate::decide::controller::Measured;
 
@@ -17,10 +19,31 @@ const MOST: usize = 256;
 /// Requests that a decision needs at least.
 const LEAST: usize = 3;
 
+/// Requests that whoever listens to them may be behind; beyond, the oldest are not told.
+const UNHEARD: usize = 1024;
+
 /// By servant.
-#[derive(Default)]
 pub(crate) struct Recent {
     by_servant: Mutex<HashMap<String, VecDeque<Took>>>,
+    told: broadcast::Sender<Answered>,
+}
+
+/// A robot's request was answered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Answered {
+    /// By the servant of this id.
+    pub servant: Arc<str>,
+    /// After so many milliseconds.
+    pub total: f64,
+}
+
+impl Default for Recent {
+    fn default() -> Self {
+        Self {
+            by_servant: Mutex::default(),
+            told: broadcast::Sender::new(UNHEARD),
+        }
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -32,12 +55,21 @@ struct Took {
 }
 
 impl Recent {
+    /// Requests that are answered from now on.
+    pub(crate) fn answered(&self) -> broadcast::Receiver<Answered> {
+        self.told.subscribe()
+    }
+
     /// A request of this servant was answered after so many milliseconds, of which it was so many in the cloud.
     pub(crate) fn note(&self, servant: &str, total: f64, cloud: f64, now: Instant) {
         // Robots are not to be trusted.
         let sane = |milliseconds: f64| milliseconds.is_finite() && milliseconds >= 0.0;
         if !sane(total) {
             return;
+        }
+        if self.told.receiver_count() > 0 {
+            let servant = Arc::from(servant);
+            let _ = self.told.send(Answered { servant, total });
         }
         let cloud = if sane(cloud) { cloud.min(total) } else { 0.0 };
         let mut all = self.by_servant.lock();

@@ -3,7 +3,7 @@
 use api::Shared;
 
 /// How robots share a service.
-#[derive(Debug, Clone, Copy, clap::Args)]
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct SharedFlags {
     /// Robots share the service's servants: each call and each goal goes to the one with the fewest. For packages that
     /// answer services and actions and keep nothing of what they are asked; others are refused.

@@ -1,4 +1,4 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
@@ -42,6 +42,19 @@ fn every_reference_leads_to_a_schema() {
             "{target} leads nowhere"
         );
     }
+}
+
+#[test]
+fn two_types_have_no_schema_of_one_name() {
+    let mut known: BTreeMap<String, Value> = BTreeMap::new();
+    for operation in ROUTES.iter().filter_map(|row| row.operation) {
+        for (name, schema) in operation().schemas {
+            let schema = serde_json::to_value(schema).expect("plain data");
+            let before = known.entry(name.clone()).or_insert_with(|| schema.clone());
+            assert_eq!(*before, schema, "{name} is the name of two");
+        }
+    }
+    assert!(known.len() > 50, "{} schemas", known.len());
 }
 
 #[test]

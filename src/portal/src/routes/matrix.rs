@@ -63,7 +63,7 @@ fn cell(route: &Route, principal: &Principal) -> &'static str {
                 let at = |robot| at_robot(principal, action, robot).is_ok();
                 word(at("them"), at("me"))
             }
-            Of::Service(_) | Of::Stub(_) | Of::Servant(_) | Of::Handler => {
+            Of::Service(_) | Of::Stub(_) | Of::Servant(_) | Of::Recording(_) | Of::Handler => {
                 at_services(principal, action)
             }
         },

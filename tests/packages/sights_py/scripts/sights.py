@@ -134,7 +134,9 @@ def publish(_):
         return
     if compressed.get_num_connections():
         compressed.publish(CompressedImage(format="png", data=png(64, 48)))
-    scans.publish(scan())
+    stamped = scan()
+    stamped.header.stamp = rospy.Time.now()
+    scans.publish(stamped)
     for publisher, told in zip(clouds, plain):
         if publisher.get_num_connections():
             publisher.publish(told)

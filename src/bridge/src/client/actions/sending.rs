@@ -91,10 +91,14 @@ impl Client {
         self.report_surplus(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
         let action = self.action_client(&name, def)?;
+        // As actionlib makes them: another node's, or one that has the same name later, makes no equal ones.
+        let now = Time::now();
         let goal_id = format!(
-            "cloudroid-{}-{}",
+            "{}-{}-{}.{:09}",
+            self.shared.bus.node(),
             self.shared.next_number(),
-            Time::now().secs
+            now.secs,
+            now.nsecs
         );
         Ok(Prepared {
             action,

@@ -1,6 +1,7 @@
 //! One value or more of every type that the document describes.
 
 mod machines;
+mod observed;
 
 use std::sync::Arc;
 
@@ -564,11 +565,12 @@ fn new_rule() -> NewRule {
     }
 }
 
+fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
+    (name, serde_json::to_value(value).expect("plain data"))
+}
+
 /// Values of every type of the document, as serde writes them, with all that is optional and without.
 pub fn samples() -> Vec<(&'static str, Value)> {
-    fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
-        (name, serde_json::to_value(value).expect("plain data"))
-    }
     let fits = Fit {
         cpus: 1.5,
         memory: Size(1),
@@ -871,5 +873,6 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         samples.push(sample("PushEvent", event));
     }
     samples.extend(machines::samples());
+    samples.extend(observed::samples());
     samples
 }

@@ -5,7 +5,7 @@ use api::machines::{
 };
 use serde_json::Value;
 
-use super::some;
+use super::{sample, some};
 
 fn patterns() -> Vec<access::Glob> {
     vec!["det*".parse().expect("a pattern")]
@@ -37,9 +37,6 @@ fn pairing() -> Pairing {
 
 /// Values of every type, with all that is optional and without.
 pub fn samples() -> Vec<(&'static str, Value)> {
-    fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Value) {
-        (name, serde_json::to_value(value).expect("plain data"))
-    }
     let bare = NewPairing {
         classes: Vec::new(),
         lifetime: None,

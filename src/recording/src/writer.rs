@@ -5,14 +5,17 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Cursor, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
-use mcap::WriteOptions;
 use mcap::records::MessageHeader;
+use mcap::{McapError, WriteOptions};
 use serde::Serialize;
+
+use crate::Error;
 
 /// A file that is being written.
 pub struct Writer {
     path: PathBuf,
+    /// The same file, to be asked how large it is: who writes it may not be allowed to look into its directory.
+    asked: File,
     file: mcap::Writer<Whole>,
     topics: BTreeMap<u16, Topic>,
     /// Bytes of messages since the last flush.
@@ -58,23 +61,35 @@ pub struct TopicSummary {
 
 impl Writer {
     /// Makes a file that is not there yet.
-    pub fn create(path: &Path) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// [`Error::NotMade`], [`Error::Unwritable`].
+    pub fn create(path: &Path) -> Result<Self, Error> {
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(path);
-        let file = file.with_context(|| {
-            format!(
-                "{} cannot be made; -o names another file, which is not there yet",
-                path.display()
-            )
+        let file = file.map_err(|source| Error::NotMade {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::of(path, file)
+    }
+
+    /// Writes into `file`, which is empty, and is at `path`.
+    ///
+    /// # Errors
+    /// [`Error::Unwritable`].
+    pub fn of(path: &Path, file: File) -> Result<Self, Error> {
+        let asked = file.try_clone().map_err(|source| Error::NotMade {
+            path: path.to_owned(),
+            source,
         })?;
         let options = WriteOptions::new()
             .profile("ros1")
-            .library(concat!("cloudroidctl ", env!("CARGO_PKG_VERSION")));
-        let file = options
-            .create(Whole::of(file))
-            .with_context(|| unwritable(path))?;
+            .library(concat!("cloudroid ", env!("CARGO_PKG_VERSION")));
+        let file = options.create(Whole::of(file)).map_err(unwritable(path))?;
         Ok(Self {
             path: path.to_owned(),
+            asked,
             file,
             topics: BTreeMap::new(),
             pending: 0,
@@ -82,14 +97,16 @@ impl Writer {
     }
 
     /// The channel of a topic whose messages are of type `of`, as `definition` says.
-    pub fn channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> anyhow::Result<u16> {
-        let unwritable = || unwritable(&self.path);
+    ///
+    /// # Errors
+    /// [`Error::Unwritable`], as of what follows.
+    pub fn channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> Result<u16, Error> {
         let schema = self.file.add_schema(of, "ros1msg", definition);
-        let schema = schema.with_context(unwritable)?;
+        let schema = schema.map_err(unwritable(&self.path))?;
         let channel = self
             .file
             .add_channel(schema, topic, "ros1", &BTreeMap::new());
-        let channel = channel.with_context(unwritable)?;
+        let channel = channel.map_err(unwritable(&self.path))?;
         self.topics.entry(channel).or_insert_with(|| Topic {
             name: topic.to_owned(),
             of: of.to_owned(),
@@ -100,7 +117,7 @@ impl Writer {
     }
 
     /// Adds a message that was heard at `time`, in nanoseconds since 1970.
-    pub fn add(&mut self, channel_id: u16, time: u64, message: &[u8]) -> anyhow::Result<()> {
+    pub fn add(&mut self, channel_id: u16, time: u64, message: &[u8]) -> Result<(), Error> {
         let mut sequence = 0;
         if let Some(topic) = self.topics.get_mut(&channel_id) {
             sequence = topic.messages;
@@ -114,7 +131,7 @@ impl Writer {
             publish_time: time,
         };
         let written = self.file.write_to_known_channel(&header, message);
-        written.with_context(|| unwritable(&self.path))?;
+        written.map_err(unwritable(&self.path))?;
         self.pending += message.len();
         match self.pending > PENDING {
             true => self.flush(),
@@ -123,9 +140,12 @@ impl Writer {
     }
 
     /// Writes out what has come.
-    pub fn flush(&mut self) -> anyhow::Result<()> {
+    ///
+    /// # Errors
+    /// [`Error::Unwritable`].
+    pub fn flush(&mut self) -> Result<(), Error> {
         self.pending = 0;
-        self.file.flush().with_context(|| unwritable(&self.path))
+        self.file.flush().map_err(unwritable(&self.path))
     }
 
     /// How many messages there are by now.
@@ -135,8 +155,8 @@ impl Writer {
     }
 
     /// Ends the file with its index.
-    pub fn finish(mut self) -> anyhow::Result<Summary> {
-        self.file.finish().with_context(|| unwritable(&self.path))?;
+    pub fn finish(mut self) -> Result<Summary, Error> {
+        self.file.finish().map_err(unwritable(&self.path))?;
         let messages = self.messages();
         let mut topics: Vec<_> = self
             .topics
@@ -149,7 +169,7 @@ impl Writer {
             })
             .collect();
         topics.sort_by(|a, b| a.topic.cmp(&b.topic));
-        let size = std::fs::metadata(&self.path).map_or(0, |found| found.len());
+        let size = self.asked.metadata().map_or(0, |found| found.len());
         Ok(Summary {
             file: self.path,
             size,
@@ -204,17 +224,17 @@ impl Seek for Whole {
     }
 }
 
-fn unwritable(path: &Path) -> String {
-    format!(
-        "{} cannot be written to its end; what it holds by now can be read",
-        path.display()
-    )
+fn unwritable(path: &Path) -> impl FnOnce(McapError) -> Error {
+    |source| Error::Unwritable {
+        path: path.to_owned(),
+        source,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::recording::Reader;
+    use crate::Reader;
 
     #[test]
     fn what_is_written_is_read_and_a_file_that_breaks_off_up_to_there() {
@@ -245,7 +265,7 @@ mod tests {
         let read = |path: &Path| {
             let mut reader = Reader::open(path).expect("it opens");
             let mut found = Vec::new();
-            while let Some(played) = reader.next().expect("it is read") {
+            while let Some(played) = reader.next_message().expect("it is read") {
                 assert_eq!(played.topic, "/chatter");
                 assert_eq!(played.of, "std_msgs/String");
                 found.push((played.time, played.message.to_vec()));
@@ -267,6 +287,6 @@ mod tests {
         }
 
         let error = Writer::create(&path).err().expect("it is there");
-        assert!(format!("{error:#}").contains("exists"), "{error:#}");
+        assert!(error.to_string().contains("exists"), "{error}");
     }
 }

@@ -1,10 +1,4 @@
-//! MCAP files (<https://mcap.dev/spec>) of what flows in a servant.
-
-mod reader;
-mod writer;
-
-pub use reader::{Played, Reader};
-pub use writer::{Summary, Writer};
+//! Which topics are wanted.
 
 /// Topics that are wanted: all where none is named; `/camera/*` is all below `/camera/`.
 #[derive(Debug, Clone, clap::Args)]

@@ -5,10 +5,11 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, anyhow};
 use mcap::McapError;
 use mcap::records::Record;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use crate::Error;
 
 /// Bytes of a record that are read at most; more is no message.
 const LARGEST: usize = 1 << 30;
@@ -48,9 +49,14 @@ pub struct Played {
 
 impl Reader {
     /// Opens a file.
-    pub fn open(path: &Path) -> anyhow::Result<Self> {
-        let file =
-            File::open(path).with_context(|| format!("{} cannot be read", path.display()))?;
+    ///
+    /// # Errors
+    /// [`Error::Unreadable`].
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let file = File::open(path).map_err(|source| Error::Unreadable {
+            path: path.to_owned(),
+            source,
+        })?;
         let options = LinearReaderOptions::default().with_record_length_limit(LARGEST);
         Ok(Self {
             path: path.to_owned(),
@@ -71,22 +77,26 @@ impl Reader {
     /// The next message.
     ///
     /// # Errors
-    /// It cannot be read, or is no MCAP file.
-    pub fn next(&mut self) -> anyhow::Result<Option<Played>> {
+    /// [`Error::Unreadable`], [`Error::NoRecording`], [`Error::Broken`].
+    pub fn next_message(&mut self) -> Result<Option<Played>, Error> {
+        let path = &self.path;
+        let broken = |reason: String| Error::Broken {
+            path: path.clone(),
+            reason,
+        };
         let unreadable = |error: McapError| match error {
-            McapError::BadMagic => anyhow!(
-                "{} is no MCAP file; cloudroidctl record writes such, and `mcap convert` makes one of a bag",
-                self.path.display()
-            ),
-            error => anyhow!("{} cannot be read on: {error}", self.path.display()),
+            McapError::BadMagic => Error::NoRecording { path: path.clone() },
+            error => broken(error.to_string()),
         };
         while !self.ended {
             match self.records.next_event() {
                 None => self.ended = true,
                 Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
                     let read = self.file.read(self.records.insert(wanted));
-                    let read =
-                        read.with_context(|| format!("{} cannot be read", self.path.display()))?;
+                    let read = read.map_err(|source| Error::Unreadable {
+                        path: path.clone(),
+                        source,
+                    })?;
                     self.records.notify_read(read);
                 }
                 Some(Ok(LinearReadEvent::Record { data, opcode })) => {
@@ -104,12 +114,11 @@ impl Reader {
                         }
                         Record::Message { header, data } => {
                             let channel = self.channels.get(&header.channel_id).cloned();
-                            let channel = channel.with_context(|| {
-                                format!(
-                                    "{} has a message of channel {}, which it does not describe",
-                                    self.path.display(),
-                                    header.channel_id
-                                )
+                            let channel = channel.ok_or_else(|| {
+                                let id = header.channel_id;
+                                broken(format!(
+                                    "it has a message of channel {id}, and does not describe that"
+                                ))
                             })?;
                             let of = self.schemas.get(&channel.schema);
                             return Ok(Some(Played {
