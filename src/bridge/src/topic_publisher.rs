@@ -189,9 +189,10 @@ impl TopicPublisher {
             .collect()
     }
 
-    /// Whether all are connected who should be, at least one.
+    /// Whether all are connected who should be, at least one. Who only observes what flows is not one.
     fn is_complete(&self, matched: &Matched) -> bool {
-        matched.connected() > 0 && self.missing(matched).is_subset(&self.given_up.lock())
+        matched.connected_beside(INSIDE) > 0
+            && self.missing(matched).is_subset(&self.given_up.lock())
     }
 
     /// Sends what waits, in order, and from now on at once.

@@ -106,41 +106,45 @@ impl Store {
     /// Copies a `tar.gz` into the store as a layer. Its digest and diff-id are found on the way.
     pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
         let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
-        self.copy_layer(file, archive, |copy| {
+        let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
             gunzip_and_hash(copy).map_err(|error| match error.kind() {
                 io::ErrorKind::UnexpectedEof
                 | io::ErrorKind::InvalidInput
                 | io::ErrorKind::InvalidData => malformed(archive, error),
                 _ => Error::file("read", archive, error),
             })
-        })
+        };
+        self.copy_layer(file, archive, read, |_| Ok(()))
     }
 
     /// The same of a file that strangers have written, called `label`, which may not hold more than `limits`; gives the number of its
-    /// entries, too.
+    /// entries, too. Nothing of it is kept unless `accept` takes it.
     pub(crate) fn import_layer_within(
         &self,
         file: File,
         label: &Path,
         limits: &Limits,
+        accept: impl FnOnce(&LayerInfo) -> Result<(), Error>,
     ) -> Result<(LayerInfo, u64), Error> {
         let mut entries = 0;
-        let layer = self.copy_layer(file, label, |copy| {
+        let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
             let content = gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
             let (digest, bytes, counted) =
                 gzip::reading_ahead(content, |content| walk(content, label, limits))?;
             entries = counted;
             Ok((digest, bytes))
-        })?;
+        };
+        let layer = self.copy_layer(file, label, read, accept)?;
         Ok((layer, entries))
     }
 
-    /// Copies what `read` reads, which finds the digest and the bytes of the content.
+    /// Copies what `read` reads, which finds the digest and the bytes of the content, and keeps it if `accept` takes it.
     fn copy_layer(
         &self,
         file: File,
         archive: &Path,
         read: impl FnOnce(&mut Tee<File, Hashing<&NewFile>>) -> Result<(Digest, u64), Error>,
+        accept: impl FnOnce(&LayerInfo) -> Result<(), Error>,
     ) -> Result<LayerInfo, Error> {
         let _hold = self.hold()?;
         let needed = file.metadata().map_or(0, |metadata| metadata.len());
@@ -163,6 +167,7 @@ impl Store {
             size,
             unpacked,
         };
+        accept(&layer)?;
         self.publish_layer(blob, &layer)?;
         Ok(layer)
     }
@@ -239,10 +244,12 @@ impl Store {
             .filter(|layer: &LayerInfo| layer.diff_id == *diff_id))
     }
 
-    /// The blob first: a record never names a blob that is not there.
+    /// The blob first: a record never names a blob that is not there. One that is there stays: the same content in other blobs would change
+    /// the digests of images that are made of it later.
     fn publish_layer(&self, blob: NewFile, layer: &LayerInfo) -> Result<(), Error> {
         self.publish_blob(blob, &layer.digest)?;
-        if self.layer_record(&layer.diff_id)? == Some(*layer) {
+        let known = self.layer_record(&layer.diff_id)?;
+        if known.is_some_and(|known| self.blob_path(&known.digest).exists()) {
             return Ok(());
         }
         files::write_whole(&self.record_path(&layer.diff_id), &json(layer))

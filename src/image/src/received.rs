@@ -1,6 +1,6 @@
 //! Images that come from elsewhere: an image layout (OCI image specification 1.1) in a tree that somebody has sent.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -90,6 +90,11 @@ impl Store {
                 diff_ids.len()
             )));
         }
+        // An overlay takes each once, and each is read and compared.
+        let distinct: BTreeSet<&Digest> = diff_ids.iter().collect();
+        if distinct.len() != diff_ids.len() {
+            return Err(unreceivable("it lists the same layer twice".to_owned()));
+        }
         let (architecture, _) = oci::platform();
         if config.architecture != architecture {
             return Err(unreceivable(format!(
@@ -138,13 +143,16 @@ impl Store {
         }
         let file = open(layout, &blob_path(&named.digest))?;
         let label = PathBuf::from(format!("layer {}", named.digest));
-        let (layer, entries) = self.import_layer_within(file, &label, left)?;
-        if layer.digest != named.digest || layer.diff_id != *diff_id {
-            return Err(unreceivable(format!(
+        let is_named = |layer: &LayerInfo| {
+            if layer.digest == named.digest && layer.diff_id == *diff_id {
+                return Ok(());
+            }
+            Err(unreceivable(format!(
                 "its layer {} has the content of {} ({}, not {diff_id}, unpacked)",
                 named.digest, layer.digest, layer.diff_id
-            )));
-        }
+            )))
+        };
+        let (layer, entries) = self.import_layer_within(file, &label, left, is_named)?;
         left.bytes -= layer.unpacked;
         left.entries -= entries;
         Ok(layer)
@@ -334,5 +342,61 @@ mod tests {
             ..Limits::default()
         };
         assert!(matches!(of(small), Refusal::TooLarge { .. }));
+    }
+
+    #[test]
+    fn the_same_layer_twice_is_refused() {
+        let root = tempfile::tempdir().expect("a directory");
+        let store = store(root.path(), "one");
+        let tree = root.path().join("tree");
+        std::fs::create_dir_all(tree.join("opt")).expect("made");
+        let layer = store.layer_from_tree(&tree, &TreeOptions::default());
+        let layer = layer.expect("a layer");
+        let twice = ImageSpec {
+            layers: vec![layer, layer],
+            ..ImageSpec::default()
+        };
+        let digest = store.put_image(&twice).expect("an image");
+        let image = store.image(&digest).expect("it is there");
+        let place = Place { root, image, store };
+        let refused = place.refused(&Limits::default()).to_string();
+        assert!(refused.contains("same layer twice"), "{refused}");
+    }
+
+    #[test]
+    fn what_is_refused_leaves_no_layer() {
+        let place = place();
+        let [lower, upper] = place.image.spec.layers[..] else {
+            panic!("two layers")
+        };
+        let of = |layer: &LayerInfo| place.store.images_dir().join(blob_path(&layer.digest));
+        std::fs::copy(of(&lower), of(&upper)).expect("another content under its name");
+        let other = store(place.root.path(), "other");
+        let refused = other.receive(&place.layout(), &Limits::default());
+        refused.expect_err("a layer is another");
+        assert!(!other.images_dir().join(blob_path(&upper.digest)).exists());
+    }
+
+    #[test]
+    fn a_layer_in_another_blob_changes_no_image_of_this_store() {
+        let place = place();
+        let lower = place.image.spec.layers[0];
+        let path = place.store.images_dir().join(blob_path(&lower.digest));
+        let mut content = Vec::new();
+        let archive = std::fs::read(path).expect("a blob");
+        io::Read::read_to_end(
+            &mut flate2::read::GzDecoder::new(&archive[..]),
+            &mut content,
+        )
+        .expect("a gzip file");
+        let again = place.root.path().join("again.tar.gz");
+        let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::none());
+        io::Write::write_all(&mut packed, &content).expect("packed");
+        std::fs::write(&again, packed.finish().expect("packed")).expect("written");
+        let other = place.store.import_layer(&again).expect("a layer");
+        assert_eq!(other.diff_id, lower.diff_id);
+        assert_ne!(other.digest, lower.digest);
+        let known = place.store.layer(&lower.diff_id).expect("it is read");
+        assert_eq!(known, Some(lower));
     }
 }

@@ -28,6 +28,10 @@ pub const RECORD: &str = "org.cloudroid.record";
 const FORMAT: u32 = 1;
 /// Characters of what was pushed, in words, that are kept: each export and import adds some.
 const LONGEST_SOURCE: usize = 200;
+/// Bytes of a record at most: as values in memory it takes many times as much.
+const LARGEST_RECORD: usize = 4 << 20;
+/// Nodes of a service at most.
+const MOST_NODES: usize = 256;
 
 /// What of a revision is not in its image.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,6 +81,12 @@ impl ServiceRecord {
             .parse()
             .and_then(|digest| image::document(layout, &digest))
             .map_err(unreceivable)?;
+        if bytes.len() > LARGEST_RECORD {
+            return Err(unreadable(&format!(
+                "it has {} bytes, and at most {LARGEST_RECORD} are read",
+                bytes.len()
+            )));
+        }
         let record: Self =
             serde_json::from_slice(&bytes).map_err(|error| unreadable(&error.to_string()))?;
         if record.format != FORMAT {
@@ -106,6 +116,12 @@ impl ServiceRecord {
         }
         if self.plan.nodes.is_empty() {
             return Err("it starts no node".to_owned());
+        }
+        if self.plan.nodes.len() > MOST_NODES {
+            return Err(format!(
+                "it starts {} nodes, and at most {MOST_NODES} can be",
+                self.plan.nodes.len()
+            ));
         }
         environment(&self.plan.environment)?;
         for node in &self.plan.nodes {

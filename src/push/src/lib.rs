@@ -186,11 +186,13 @@ impl Pusher {
         }
         let shown = self.shown(id, options, (built, plan), (name.clone(), by), report);
         let layers = left.during(shown).await?;
-        if let Some((record, _)) = &imported {
-            self.take_over_rows(&name, record, report).await?;
-        }
+        // Before anything that may fail or wait: what is published has an owner.
         if let Some(owner) = by.owner.as_deref().filter(|_| is_new) {
             self.catalogue.own(&name, owner)?;
+        }
+        if let Some((record, _)) = &imported {
+            let rows = self.take_over_rows(&name, record, report);
+            left.during(rows).await?;
         }
         Ok(Published {
             layers,

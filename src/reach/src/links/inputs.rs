@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Publisher, Qos, WireType, reaches};
+use ros::bus::{Publisher, Qos, WireType};
 use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
 use ros::sizes::Sizes;
@@ -121,11 +121,14 @@ impl Inputs {
             (count, publisher.is_none())
         });
         let graph = hub.bus.graph().borrow().clone();
-        let listeners = graph
-            .topics
-            .get(&input.topic)
-            .map_or(0, |ends| ends.subscribers.len());
-        let connected = reaches(publisher.matched(), listeners.max(1));
+        // Who only observes what flows may be connected before the node is.
+        let listeners = graph.topics.get(&input.topic).map_or(0, |ends| {
+            let nodes = ends.subscribers.iter();
+            nodes.filter(|node| *node != bridge::INSIDE).count()
+        });
+        let mut matched = publisher.matched();
+        let connected = matched
+            .wait_for(|matched| matched.connected_beside(bridge::INSIDE) >= listeners.max(1));
         let _ = tokio::time::timeout(hub.options.warm_up, connected).await;
         let mut channels = self.channels.lock();
         if let Some(channel) = channels.get_mut(&input.channel) {

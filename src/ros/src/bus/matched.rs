@@ -60,6 +60,12 @@ impl Matched {
         self.peers.iter().filter(|peer| peer.connected).count()
     }
 
+    /// How many are connected beside the node of this name, which listens without being meant.
+    pub fn connected_beside(&self, node: &str) -> usize {
+        let connected = self.peers.iter().filter(|peer| peer.connected);
+        connected.filter(|peer| peer.id.node() != node).count()
+    }
+
     /// Whether this one has not left. Who has left has sent all that it had.
     pub fn contains(&self, id: &PeerId) -> bool {
         self.peers.iter().any(|peer| peer.id == *id)

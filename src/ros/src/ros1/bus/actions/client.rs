@@ -12,7 +12,7 @@ use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Matched, Outcome, Publisher,
+    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Graph, Matched, Outcome, Publisher,
     Subscription,
 };
 use crate::codec::Time;
@@ -223,12 +223,18 @@ impl Shared {
         Some(self.ends.get()?.goal.matched())
     }
 
-    fn is_connected(&self) -> bool {
-        self.matched()
-            .is_some_and(|matched| matched.borrow().connected() > 0)
+    /// Whether somebody takes goals here who also sends results. Who only observes goals does not.
+    fn has_server(&self, matched: &Matched, graph: &Graph) -> bool {
+        let results = graph.topics.get(&format!("{}/result", self.name));
+        results.is_some_and(|ends| ends.publishers.iter().any(|node| matched.has_node(node)))
     }
 
-    /// Returns once all are connected who are registered to take goals, at least one.
+    fn is_connected(&self) -> bool {
+        self.matched()
+            .is_some_and(|matched| self.has_server(&matched.borrow(), &self.bus.graph.borrow()))
+    }
+
+    /// Returns once all are connected who are registered to take goals, a server among them.
     async fn takes_goals(&self) {
         let Some(mut matched) = self.matched() else {
             return;
@@ -241,7 +247,7 @@ impl Shared {
                 let servers = graph.topics.get(&topic).map(|nodes| &nodes.subscribers);
                 let mut others = servers.into_iter().flatten();
                 let others = others.all(|node| *node == self.bus.node || matched.has_node(node));
-                matched.connected() > 0 && others
+                others && self.has_server(&matched, &graph)
             };
             if complete {
                 return;

@@ -114,3 +114,18 @@ async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
         assert_ne!(method, "getBusInfo");
     }
 }
+
+#[tokio::test]
+async fn who_only_observes_goals_is_no_server() {
+    let master = TestMaster::start().await;
+    let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
+    let observed = two.subscribe("/dig/goal", WireType::any(), Qos::keep_last(1));
+    let observed = observed.await.unwrap();
+    let client = one.action_client("/dig", &dig()).unwrap();
+    let connected = crate::bus::reaches(observed.matched.clone(), 1);
+    tokio::time::timeout(LONG, connected).await.unwrap();
+    let ready = client.ready(Duration::from_millis(300)).await;
+    assert!(matches!(ready, Err(BusError::Timeout { .. })), "{ready:?}");
+    let _server = serves(&two);
+    client.ready(LONG).await.unwrap();
+}
