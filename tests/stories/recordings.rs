@@ -13,6 +13,7 @@ use support::binaries;
 use support::deployer::{path_str, run};
 use support::world::world;
 
+use crate::access::token;
 use crate::inside::Scene;
 
 /// What the format's own Python package finds in a file.
@@ -354,7 +355,14 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     })?;
     // Once in a minute, however often it waits.
     rover.calls("/sights/ping", json!({}))?;
-    ensure!(listed(&[])?.len() == 1, "more than one");
+    let times: Vec<u64> = listed(&[])?
+        .iter()
+        .filter_map(|one| one["time"].as_u64())
+        .collect();
+    ensure!(
+        !times.is_empty() && times.windows(2).all(|two| two[0] - two[1] > 59_000),
+        "{times:?}"
+    );
 
     // It holds what was published before, what was latched long ago, and nothing else.
     let number = written["number"].to_string();
@@ -402,8 +410,38 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         std::fs::read(&copy)? == std::fs::read(&file)?,
         "another file"
     );
+    // As far as rules let her hear what is in it.
+    let refused = |who: &str| typed_by(who, &["get", &number])?.failed_saying(&["may not hear"]);
+    let allow = |grant: &str| {
+        let rule = ["policy", "allow", "narrow", grant, "--service", "sights*"];
+        types(&rule)?.succeeded()
+    };
+    let narrow = scene.viewer("narrow", "sights*")?;
+    allow("subscribe:/sights/scan")?;
+    ensure!(refused(&narrow)?.status == 4, "another status");
+    let hidden = typed_by(&narrow, &["list"])?.succeeded()?;
+    ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
+    allow("subscribe:/tf*")?;
+    let had = place.path().join("had.mcap");
+    typed_by(&narrow, &["get", &number, "-o", path_str(&had)])?.succeeded()?;
+    // A robot has its own, and no other's.
+    let own = place.path().join("own.mcap");
+    typed_by(&scene.token, &["get", &number, "-o", path_str(&own)])?.succeeded()?;
+    let other = [
+        "other",
+        "--role",
+        "robot",
+        "--robot",
+        "other",
+        "--service",
+        "sights*",
+    ];
+    let other = token(&scene.daemon, &other)?;
+    let hidden = typed_by(&other, &["list"])?.succeeded()?;
+    ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
     for (who, words, status) in [
-        (&eve, &["take", &scene.servant][..], 4),
+        (&other, &["get", &number][..], 4),
+        (&eve, &["take", &scene.servant], 4),
         (&eve, &["rm", &number], 4),
         (&stranger, &["get", &number], 4),
         (&stranger, &["rm", &number], 4),
@@ -417,9 +455,18 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         .failed_saying(&["there is no recording 99", "recordings list"])?;
 
     // Beyond two files the oldest goes.
+    let take = || types(&["recordings", "take", &scene.servant]);
     for _ in 0..2 {
-        types(&["recordings", "take", &scene.servant])?.succeeded()?;
+        support::until("another file", || {
+            let taken = take()?;
+            Ok((taken.status == 0)
+                .then_some(())
+                .ok_or_else(|| taken.said()))
+        })?;
     }
+    // Nobody takes one after the other.
+    let soon = take()?.failed_saying(&["a moment ago"])?;
+    ensure!(soon.status == 7, "{}", soon.status);
     let all = listed(&[])?;
     ensure!(
         all.len() == 2 && all.iter().all(|one| one["number"] != written["number"]),

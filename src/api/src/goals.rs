@@ -14,9 +14,9 @@ pub struct Goal {
     pub action: String,
     /// As its client has called it.
     pub id: String,
-    /// Who sent it, in words.
+    /// Who sent it, in words; or that this was not heard.
     pub by: String,
-    /// When it was heard of.
+    /// When it was heard of: when it ended, where only that was heard.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub began: Millis,
     /// When it ended.

@@ -100,6 +100,10 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub dropped: u64,
+    /// Of which topics messages were dropped, those of its links among them; the ten with most, the most first.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub drops: Vec<TopicDrops>,
     /// Its nodes that failed and are not started again yet.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
@@ -108,6 +112,16 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub hung: Vec<String>,
+}
+
+/// Messages of a topic that were dropped.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct TopicDrops {
+    /// The topic.
+    pub topic: String,
+    /// How many so far.
+    pub count: u64,
 }
 
 /// How long requests took that were answered within the last ten seconds: calls of services, goals, and messages on topics where

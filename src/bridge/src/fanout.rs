@@ -184,6 +184,7 @@ impl Fanout {
             Ok(sample) => Arc::new(sample),
             Err(full) => {
                 tracing::debug!(topic = %self.topic, %full, "a message is left out");
+                shared.metrics.drops.add(&self.topic, 1);
                 return shared.metrics.dropped.add(1);
             }
         };
@@ -283,6 +284,7 @@ async fn pump(
         let now_dropped = subscription.dropped.get();
         if now_dropped > dropped {
             metrics.bus_dropped.add(now_dropped - dropped);
+            metrics.drops.add(&fanout.topic, now_dropped - dropped);
             dropped = now_dropped;
         }
     }

@@ -61,6 +61,6 @@ pub const INSIDE: &str = "/cloudroid_inside";
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
 pub use granted::Granted;
-pub use metrics::{Counter, Metrics};
+pub use metrics::{Counter, Drops, Metrics};
 pub use options::{BridgeOptions, Called, SessionOptions};
 pub use waiting::Waiting;

@@ -1,7 +1,10 @@
 //! What a bridge has done, counted.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use parking_lot::Mutex;
 use ros::ring::Lost;
 
 /// A number that only grows.
@@ -20,12 +23,41 @@ impl Counter {
     }
 }
 
+/// Topics whose drops are told by name at most; clients name topics as they like.
+const MOST_TOPICS: usize = 256;
+
+/// Messages that were dropped, by topic.
+#[derive(Debug, Default)]
+pub struct Drops(Mutex<BTreeMap<String, u64>>);
+
+impl Drops {
+    /// Counts messages of a topic.
+    pub fn add(&self, topic: &str, count: u64) {
+        if count == 0 {
+            return;
+        }
+        let mut topics = self.0.lock();
+        if let Some(known) = topics.get_mut(topic) {
+            *known += count;
+        } else if topics.len() < MOST_TOPICS {
+            topics.insert(topic.to_owned(), count);
+        }
+    }
+
+    /// All so far, by topic.
+    pub fn all(&self) -> BTreeMap<String, u64> {
+        self.0.lock().clone()
+    }
+}
+
 macro_rules! metrics {
     ($($(#[doc = $doc:literal])* $field:ident => $name:literal,)*) => {
         /// Counters of one bridge, over all its sessions.
         #[derive(Debug, Default)]
         pub struct Metrics {
             $($(#[doc = $doc])* pub $field: Counter,)*
+            /// Of the dropped messages, on the way to clients and from them, which topics they were of.
+            pub drops: Arc<Drops>,
         }
 
         impl Metrics {
@@ -93,6 +125,21 @@ impl Metrics {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn drops_are_counted_by_topic_and_topics_without_end_are_not() {
+        let drops = Drops::default();
+        drops.add("/a", 2);
+        drops.add("/a", 3);
+        drops.add("/b", 0);
+        assert_eq!(drops.all(), BTreeMap::from([("/a".to_owned(), 5)]));
+        for number in 0..1000 {
+            drops.add(&format!("/{number}"), 1);
+        }
+        drops.add("/a", 1);
+        let all = drops.all();
+        assert_eq!((all.len(), all["/a"]), (MOST_TOPICS, 6));
+    }
 
     #[test]
     fn every_counter_is_told_by_its_name_with_what_it_counts() {

@@ -183,7 +183,7 @@ impl Outbox {
     }
 
     pub(crate) fn add_topic(&self, topic: Arc<str>, wishes: Wishes) -> TopicKey {
-        let queue = TopicQueue::new(topic, wishes, self.limits.topic);
+        let queue = TopicQueue::new(topic, wishes, self.limits.topic, self.metrics.drops.clone());
         self.queues.lock().topics.add(queue)
     }
 

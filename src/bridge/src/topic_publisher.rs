@@ -23,6 +23,18 @@ const WARM: Bounds = Bounds {
     bytes: 16 << 20,
 };
 
+/// So many times as long a node is waited for that has registered, where nobody else is connected: on a busy machine rospy takes seconds.
+const ALONE: u32 = 10;
+
+/// Until when subscribers are waited for.
+#[derive(Clone, Copy)]
+struct Patience {
+    /// Those that are missing while others are connected.
+    some: Instant,
+    /// Those that are registered, while nobody is connected.
+    none: Instant,
+}
+
 /// One client's advertisement of one topic.
 pub(crate) struct TopicPublisher {
     pub(crate) topic: String,
@@ -122,8 +134,7 @@ impl TopicPublisher {
             {
                 *state = State::warming(Some(publisher));
             }
-            let deadline = Instant::now() + self.shared.options.warm_up;
-            tokio::spawn(settle(self.clone(), subscribers, deadline));
+            tokio::spawn(settle(self.clone(), subscribers, self.patience()));
         }
         match &mut *state {
             State::Live { publisher, .. } => {
@@ -134,7 +145,12 @@ impl TopicPublisher {
                 publisher.publish(bytes);
             }
             State::Failed => {}
-            State::Warming { waiting, .. } => self.shared.metrics.lost(waiting.push(bytes)),
+            State::Warming { waiting, .. } => {
+                let lost = waiting.push(bytes);
+                let metrics = &self.shared.metrics;
+                metrics.drops.add(&self.topic, lost.messages);
+                metrics.lost(lost);
+            }
         }
     }
 
@@ -168,6 +184,15 @@ impl TopicPublisher {
             *settled = generation;
         }
         incomplete
+    }
+
+    /// Until when subscribers are waited for from now on.
+    fn patience(&self) -> Patience {
+        let (warm_up, now) = (self.shared.options.warm_up, Instant::now());
+        Patience {
+            some: now + warm_up,
+            none: now + warm_up * ALONE,
+        }
     }
 
     /// Nodes that the Master names as subscribers, and that are not connected. The bridge itself may be among those
@@ -228,7 +253,7 @@ async fn warm_up(
     failed: impl FnOnce(String) + Send,
 ) {
     let shared = topic_publisher.shared.clone();
-    let deadline = Instant::now() + shared.options.warm_up;
+    let patience = topic_publisher.patience();
     let publisher = match shared.bus.advertise(&topic_publisher.topic, of, qos).await {
         Ok(publisher) => publisher,
         Err(error) => {
@@ -243,15 +268,37 @@ async fn warm_up(
     {
         *held = Some(publisher);
     }
-    settle(topic_publisher, subscribers, deadline).await;
+    settle(topic_publisher, subscribers, patience).await;
 }
 
-/// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits.
+/// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits. As long as nobody at all is
+/// connected, nobody waits either for what a slow node lacks: it has more time.
 async fn settle(
     topic_publisher: Arc<TopicPublisher>,
     mut subscribers: watch::Receiver<Matched>,
-    deadline: Instant,
+    patience: Patience,
 ) {
+    let mut in_time = connected(&topic_publisher, &mut subscribers, patience.some).await;
+    let is_slow = {
+        let matched = subscribers.borrow();
+        matched.connected_beside(INSIDE) == 0 && !topic_publisher.missing(&matched).is_empty()
+    };
+    if !in_time && is_slow {
+        in_time = connected(&topic_publisher, &mut subscribers, patience.none).await;
+    }
+    if !in_time {
+        // Not waited for again while they are what they are.
+        *topic_publisher.given_up.lock() = topic_publisher.missing(&subscribers.borrow());
+    }
+    topic_publisher.go_live();
+}
+
+/// Whether all are connected who should be before this time, or the topic has ended.
+async fn connected(
+    topic_publisher: &TopicPublisher,
+    subscribers: &mut watch::Receiver<Matched>,
+    until: Instant,
+) -> bool {
     let connected = async {
         loop {
             let matched = subscribers.borrow_and_update().clone();
@@ -263,11 +310,7 @@ async fn settle(
             }
         }
     };
-    if timeout_at(deadline.into(), connected).await.is_err() {
-        // Not waited for again while they are what they are.
-        *topic_publisher.given_up.lock() = topic_publisher.missing(&subscribers.borrow());
-    }
-    topic_publisher.go_live();
+    timeout_at(until.into(), connected).await.is_ok()
 }
 
 #[cfg(test)]

@@ -85,7 +85,23 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
         TopicPublisher::open(&shared, "/number", message_type.clone(), false, 10, failed);
     let subscribers = advertised(&topic_publisher).await;
     assert!(!is_live(&topic_publisher), "it waits");
-    settle(topic_publisher.clone(), subscribers, Instant::now()).await;
+    let over = Instant::now();
+    let later = Instant::now() + PATIENCE * 10;
+    let still = Patience {
+        some: over,
+        none: later,
+    };
+    let waiting = settle(topic_publisher.clone(), subscribers.clone(), still);
+    let waited = timeout(Duration::from_millis(100), waiting).await;
+    assert!(
+        waited.is_err() && !is_live(&topic_publisher),
+        "nobody else waits for it"
+    );
+    let both = Patience {
+        some: over,
+        none: over,
+    };
+    settle(topic_publisher.clone(), subscribers, both).await;
     assert!(is_live(&topic_publisher), "it has waited long enough");
 
     // The graph changes, and what is published goes out at once all the same.

@@ -8,6 +8,7 @@ use ros::bus::PeerId;
 use ros::ring::{Bounds, Held, Lost, Ring};
 use rosbridge::{Compression, Id};
 
+use crate::Drops;
 use crate::sample::Sample;
 
 /// Latching publishers remembered.
@@ -73,6 +74,8 @@ impl Load {
 pub(crate) struct TopicQueue {
     /// The topic as the client wrote it.
     pub(crate) topic: Arc<str>,
+    /// Where what it drops is counted.
+    drops: Arc<Drops>,
     pub(crate) wishes: Wishes,
     limits: Bounds,
     samples: Ring<Waiting>,
@@ -87,9 +90,10 @@ pub(crate) struct TopicQueue {
 }
 
 impl TopicQueue {
-    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: Bounds) -> Self {
+    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: Bounds, drops: Arc<Drops>) -> Self {
         Self {
             topic,
+            drops,
             wishes,
             limits,
             samples: Ring::unbounded(),
@@ -173,6 +177,7 @@ impl TopicQueue {
         drop(waiting);
         let gone = self.samples.remove(spare)?;
         self.big -= gone.sample.big();
+        self.drops.add(&self.topic, 1);
         Some(Lost::one(&gone))
     }
 

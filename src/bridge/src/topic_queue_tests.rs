@@ -35,6 +35,7 @@ fn queue(throttle: u64, length: usize) -> TopicQueue {
             messages: 5,
             bytes: 1000,
         },
+        Arc::default(),
     )
 }
 
@@ -54,6 +55,7 @@ fn the_newest_win_within_messages_and_bytes() {
         let _ = messages.push(sample("/p", false, size), false, now);
     }
     assert_eq!(sizes(&messages), [3, 4, 5, 6, 7]);
+    assert_eq!(messages.drops.all()["/x"], 2, "told by topic");
     assert_eq!(messages.load().bytes, 25);
     let mut bytes = queue(0, 0);
     let _ = bytes.push(sample("/p", false, 600), false, now);

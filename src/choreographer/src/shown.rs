@@ -1,9 +1,13 @@
 //! What the API shows of a servant.
 
 use api::Phase;
+use reach::Reach;
 use tokio::time::Instant;
 
 use crate::{Choreographer, Handle, limits};
+
+/// Topics whose drops are shown.
+const SHOWN_DROPS: usize = 10;
 
 impl Choreographer {
     /// A servant as the API shows it.
@@ -43,11 +47,19 @@ impl Choreographer {
             usage: usage(handle).await,
             response: inner.recent.shown(&handle.id, Instant::now().into_std()),
             pids: pids.unwrap_or_default(),
-            dropped: reach.map_or(0, |reach| reach.dropped()),
+            dropped: reach.as_ref().map_or(0, |reach| reach.dropped()),
+            drops: reach.map(|reach| drops(&*reach)).unwrap_or_default(),
             down: handle.down(),
             hung: handle.hung(),
         }
     }
+}
+
+/// Topics that lost most.
+fn drops(reach: &dyn Reach) -> Vec<api::TopicDrops> {
+    let topics = reach.drops().into_iter().take(SHOWN_DROPS);
+    let told = topics.map(|(topic, count)| api::TopicDrops { topic, count });
+    told.collect()
 }
 
 /// What a servant uses, while it runs.

@@ -28,7 +28,9 @@ impl Goals {
         }
         let mut table = Table::new(&["ACTION", "SENT BY", "AT", "OUTCOME", "AFTER", "SAID"]);
         for goal in goals {
+            // Of one of which only the end was heard nobody knows.
             let took = goal.ended.map(|ended| ended.saturating_sub(goal.began));
+            let took = took.filter(|took| *took > 0);
             table.row([
                 goal.action,
                 goal.by,

@@ -302,7 +302,7 @@ fn packing_failed(packing: Option<archive::Packing>) -> Option<anyhow::Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::Parser;
+    use clap::{CommandFactory, Parser};
 
     #[derive(Debug, Parser)]
     struct Line {
@@ -375,6 +375,90 @@ mod tests {
         assert_eq!(options.args["word"], "bonjour");
         assert_eq!(options.args["empty"], "");
         assert_eq!(options.source, "./pkg");
+    }
+
+    /// The page's fields, one a line.
+    const FIELDS: &str = include_str!("../../../web/src/lib/options.ts");
+    /// The form around them.
+    const FORM: &str = include_str!("../../../web/src/pages/Deploy.svelte");
+
+    /// Between two others, where both are.
+    fn between<'a>(line: &'a str, before: &str, after: &str) -> Option<&'a str> {
+        let (_, rest) = line.split_once(before)?;
+        Some(rest.split_once(after)?.0)
+    }
+
+    /// Flag and label of each of the page's fields.
+    fn fields() -> Vec<(&'static str, &'static str)> {
+        let field = |line: &'static str| {
+            let flag = between(line, "flag: '", "'")?;
+            let label = between(line, "label: '", "', flag: ")
+                .or_else(|| between(line, "label: \"", "\", flag: "))?;
+            Some((flag, label))
+        };
+        FIELDS.lines().filter_map(field).collect()
+    }
+
+    #[test]
+    fn the_page_asks_for_all_that_the_command_line_does() {
+        let fields = fields();
+        assert!(fields.len() > 30, "{fields:?}");
+        // Chosen in the form, not written.
+        let chosen = ["--apt", "--stateful", "--shared", "--idempotent"];
+        // The service's own page shows how a rollout goes on, for as long as it is open.
+        let needless = ["--wait"];
+        let command = Line::command();
+        let flags: Vec<String> = command
+            .get_arguments()
+            .filter_map(|argument| Some(format!("--{}", argument.get_long()?)))
+            .collect();
+        for flag in &flags {
+            let written = fields.iter().any(|(named, _)| named == flag);
+            let is_chosen = chosen.contains(&&**flag) && FORM.contains(&**flag);
+            assert!(
+                written || is_chosen || needless.contains(&&**flag),
+                "the page does not ask for {flag}"
+            );
+        }
+        let written = fields.iter().map(|(flag, _)| *flag);
+        for flag in written.chain(chosen).chain(needless) {
+            assert!(
+                flags.iter().any(|known| known == flag),
+                "there is no {flag}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_page_names_the_defaults_that_hold() {
+        let (shared, terms) = (
+            api::Shared::default(),
+            api::rollout::RolloutTerms::default(),
+        );
+        let hold = [
+            ("--min", f64::from(shared.min)),
+            ("--max", f64::from(shared.max)),
+            ("--replicas", f64::from(shared.replicas)),
+            ("--calls", f64::from(shared.calls)),
+            ("--bound", terms.bound),
+            ("--samples", f64::from(terms.samples)),
+            // The kernel's, as cgroup-v2.rst has it.
+            ("--cpu-weight", 100.0),
+        ];
+        let named = |label: &str| {
+            let (before, _) = label.split_once(" by default")?;
+            before.rsplit(' ').next()?.parse::<f64>().ok()
+        };
+        let fields = fields();
+        for (flag, holds) in hold {
+            let label = fields.iter().find(|(named, _)| *named == flag);
+            let label = label.map(|(_, label)| *label).unwrap_or_default();
+            assert_eq!(named(label), Some(holds), "{flag}: {label:?}");
+        }
+        for (flag, label) in fields {
+            let known = hold.iter().any(|(known, _)| *known == flag);
+            assert!(known || named(label).is_none(), "{flag}: {label:?}");
+        }
     }
 
     #[test]

@@ -7,9 +7,13 @@ use parking_lot::Mutex;
 use ros::bus::{Message, WireType};
 
 use crate::follow::{Followed, Observer, Seen, follow, now};
+use crate::numbered::Numbered;
 
 /// Ages that make sense: stamps of a simulation, or of a recording, are of another time.
 const AGES: std::ops::Range<i64> = -60_000_000_000..60_000_000_000;
+
+/// Ages of a topic's messages that are kept until somebody takes the figures.
+const MOST_AGES: usize = 10_000;
 
 /// What was published on a topic in a time.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,8 +40,7 @@ pub struct Figures {
 
 #[derive(Default)]
 struct Counts {
-    /// By number.
-    all: Mutex<Vec<Count>>,
+    all: Mutex<Numbered<Count>>,
 }
 
 struct Count {
@@ -47,7 +50,7 @@ struct Count {
     published: bool,
     messages: u64,
     bytes: u64,
-    /// Nanoseconds.
+    /// Nanoseconds; of the first messages alone, where they are many.
     ages: Vec<i64>,
 }
 
@@ -66,14 +69,20 @@ impl Figures {
     /// Since they were taken last, and how long that is; by name.
     pub fn take(&self) -> (Duration, Vec<TopicFigures>) {
         let since = std::mem::replace(&mut *self.since.lock(), Instant::now());
-        let mut all = self.counts.all.lock();
-        let mut taken: Vec<TopicFigures> = all
+        (since.elapsed(), self.counts.take())
+    }
+}
+
+impl Counts {
+    fn take(&self) -> Vec<TopicFigures> {
+        let mut all = self.all.lock();
+        let counted = all
             .iter_mut()
-            .filter(|count| count.published || count.messages > 0)
-            .map(Count::take)
-            .collect();
+            .filter(|(_, count)| count.published || count.messages > 0);
+        let mut taken: Vec<TopicFigures> = counted.map(|(_, count)| count.take()).collect();
+        all.retain(|_, count| count.published);
         taken.sort_by(|a, b| a.topic.cmp(&b.topic));
-        (since.elapsed(), taken)
+        taken
     }
 }
 
@@ -97,30 +106,31 @@ impl Observer for Counts {
         true
     }
 
-    fn begins(&self, topic: &str, of: WireType) -> Option<u16> {
+    fn begins(&self, topic: &str, of: WireType) -> Option<u32> {
         let mut all = self.all.lock();
-        let known = all
-            .iter()
-            .position(|count| count.topic == topic && count.of == of.name);
-        let number = u16::try_from(known.unwrap_or(all.len())).ok()?;
-        match known {
-            Some(at) => all[at].published = true,
-            None => all.push(Count {
-                topic: topic.to_owned(),
-                stamped: is_stamped(&of.definition),
-                of: of.name,
-                published: true,
-                messages: 0,
-                bytes: 0,
-                ages: Vec::new(),
-            }),
+        let known = all.find(|count| count.topic == topic && count.of == of.name);
+        if let Some(number) = known {
+            all.get_mut(number)?.published = true;
+            return Some(number);
         }
-        Some(number)
+        if all.is_full() {
+            // Nobody takes them, and topics come and go.
+            all.retain(|_, count| count.published);
+        }
+        all.add(Count {
+            topic: topic.to_owned(),
+            stamped: is_stamped(&of.definition),
+            of: of.name,
+            published: true,
+            messages: 0,
+            bytes: 0,
+            ages: Vec::new(),
+        })
     }
 
-    fn hears(&self, topic: u16, message: Message) {
+    fn hears(&self, topic: u32, message: Message) {
         let mut all = self.all.lock();
-        let Some(count) = all.get_mut(usize::from(topic)) else {
+        let Some(count) = all.get_mut(topic) else {
             return;
         };
         count.messages += 1;
@@ -128,6 +138,7 @@ impl Observer for Counts {
         // What was latched is as old as it is.
         if count.stamped
             && !message.latching
+            && count.ages.len() < MOST_AGES
             && let Some(stamp) = header_stamp(&message.bytes)
             && let Some(age) = i64::try_from(now())
                 .ok()
@@ -140,7 +151,7 @@ impl Observer for Counts {
 
     fn ends(&self, topic: &str) {
         let mut all = self.all.lock();
-        for count in all.iter_mut().filter(|count| count.topic == topic) {
+        for (_, count) in all.iter_mut().filter(|(_, count)| count.topic == topic) {
             count.published = false;
         }
     }
@@ -169,6 +180,7 @@ fn is_stamped(definition: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::numbered::MOST;
 
     #[test]
     fn messages_that_begin_with_a_header_have_a_stamp() {
@@ -181,5 +193,38 @@ mod tests {
         let message = [[9, 0, 0, 0], [2, 0, 0, 0], [5, 0, 0, 0]].concat();
         assert_eq!(header_stamp(&message), Some(2_000_000_005));
         assert_eq!(header_stamp(&message[..11]), None);
+    }
+
+    #[test]
+    fn figures_that_nobody_takes_are_bounded() {
+        let counts = Counts::default();
+        let of = WireType::new("a/Stamped", "digest", "Header header");
+        let topic = counts.begins("/scan", of.clone()).expect("room");
+        let seconds = u32::try_from(now() / 1_000_000_000).expect("this century");
+        let words = [0, seconds, 0].map(u32::to_le_bytes);
+        let message = Message {
+            bytes: words.concat().into(),
+            wire_type: Arc::new(of.clone()),
+            publisher: ros::bus::PeerId::from("/node"),
+            latching: false,
+        };
+        let many = MOST_AGES + 10;
+        (0..many).for_each(|_| counts.hears(topic, message.clone()));
+        let ages = |number| counts.all.lock().get(number).map(|count| count.ages.len());
+        assert_eq!(ages(topic), Some(MOST_AGES));
+        // Topics that come and go, too.
+        for number in 0..2 * MOST {
+            let topic = format!("/topic{number}");
+            assert!(counts.begins(&topic, of.clone()).is_some(), "{topic}");
+            counts.ends(&topic);
+        }
+        let taken = counts.take();
+        assert_eq!(taken.len(), 1, "{taken:?}");
+        assert_eq!(taken[0].messages, many as u64);
+        assert_eq!(counts.all.lock().iter_mut().count(), 1);
+        // What has just ended is told once more.
+        counts.hears(topic, message);
+        counts.ends("/scan");
+        assert_eq!((counts.take().len(), counts.take().len()), (1, 0));
     }
 }

@@ -28,9 +28,9 @@ pub(crate) trait Observer: Send + Sync + 'static {
     /// Whether it hears this topic, whose type is called so.
     fn wants(&self, topic: &str, named: &str) -> bool;
     /// The topic is heard from now on. Its number, by which messages are told; none: it is not heard.
-    fn begins(&self, topic: &str, of: WireType) -> Option<u16>;
+    fn begins(&self, topic: &str, of: WireType) -> Option<u32>;
     /// A message of the topic of this number.
-    fn hears(&self, topic: u16, message: Message);
+    fn hears(&self, topic: u32, message: Message);
     /// Nobody publishes the topic any more.
     fn ends(&self, topic: &str);
 }

@@ -11,6 +11,7 @@ use ros::ros1::actions::messages::{self, Status};
 use tokio::sync::watch;
 
 use crate::follow::{Followed, Observer, Seen, follow, now};
+use crate::numbered::Numbered;
 
 /// Goals that are remembered; beyond, the oldest that have ended go first.
 const MOST: usize = 200;
@@ -24,12 +25,23 @@ pub struct Goal {
     pub action: String,
     /// As its client has called it.
     pub id: String,
-    /// The node that sent it; none where it was sent by this side.
-    pub client: Option<String>,
-    /// When it was heard of first, nanoseconds since 1970.
+    /// Who sent it.
+    pub sender: Sender,
+    /// When it was heard of first, nanoseconds since 1970: of one that was not heard itself, when it ended.
     pub began: u64,
     /// How it ended, and when; none: it has not yet.
     pub ended: Option<(u64, Outcome)>,
+}
+
+/// Who sent a goal.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Sender {
+    /// This side, which does not hear itself: the goal is known by its id.
+    Inside,
+    /// This node.
+    Node(String),
+    /// The result was heard alone: the goal was sent before anybody listened, or where nobody can.
+    Unheard,
 }
 
 /// How a goal ended.
@@ -39,6 +51,8 @@ pub struct Outcome {
     pub status: Status,
     /// The server's words.
     pub text: String,
+    /// The how manieth it is of those that were heard to end; from 1.
+    pub number: u64,
 }
 
 /// Hears a servant's actions until it is dropped.
@@ -52,8 +66,8 @@ struct Heard {
     own: String,
     all: Mutex<VecDeque<Goal>>,
     /// By number.
-    topics: Mutex<Vec<(String, Kind)>>,
-    /// Grows with each goal that has ended.
+    topics: Mutex<Numbered<(String, Kind)>>,
+    /// Grows with each goal that has ended, while all are locked.
     ended: watch::Sender<u64>,
 }
 
@@ -84,6 +98,11 @@ impl Goals {
         self.heard.all.lock().iter().rev().cloned().collect()
     }
 
+    /// Those that have ended after so many had, the first of them first; without those that are not remembered any more.
+    pub fn ended_after(&self, number: u64) -> Vec<Goal> {
+        self.heard.ended_after(number)
+    }
+
     /// Grows with each goal that has ended.
     pub fn ended(&self) -> watch::Receiver<u64> {
         self.heard.ended.subscribe()
@@ -106,19 +125,15 @@ impl Observer for Heard {
         part(topic, named).is_some()
     }
 
-    fn begins(&self, topic: &str, of: WireType) -> Option<u16> {
+    fn begins(&self, topic: &str, of: WireType) -> Option<u32> {
         let part = part(topic, &of.name)?;
         let mut topics = self.topics.lock();
-        let known = topics.iter().position(|known| *known == part);
-        let number = u16::try_from(known.unwrap_or(topics.len())).ok()?;
-        if known.is_none() {
-            topics.push(part);
-        }
-        Some(number)
+        let known = topics.find(|known| *known == part);
+        known.or_else(|| topics.add(part))
     }
 
-    fn hears(&self, topic: u16, message: Message) {
-        let Some((action, kind)) = self.topics.lock().get(usize::from(topic)).cloned() else {
+    fn hears(&self, topic: u32, message: Message) {
+        let Some((action, kind)) = self.topics.lock().get(topic).cloned() else {
             return;
         };
         let client = message.publisher.node();
@@ -128,14 +143,38 @@ impl Observer for Heard {
         };
     }
 
-    fn ends(&self, _topic: &str) {}
+    fn ends(&self, topic: &str) {
+        self.topics.lock().retain(|_, (action, kind)| {
+            let last = match kind {
+                Kind::Goal => "/goal",
+                Kind::Result => "/result",
+            };
+            topic.strip_suffix(last) != Some(action)
+        });
+    }
 }
 
 impl Heard {
+    fn ended_after(&self, number: u64) -> Vec<Goal> {
+        let number_of = |goal: &Goal| goal.ended.as_ref().map_or(0, |(_, outcome)| outcome.number);
+        let all = self.all.lock();
+        let mut ended: Vec<Goal> = all
+            .iter()
+            .filter(|goal| number_of(goal) > number)
+            .cloned()
+            .collect();
+        drop(all);
+        ended.sort_by_key(number_of);
+        ended
+    }
+
     fn sent(&self, action: String, bytes: &Bytes, client: &str) -> Option<()> {
         let (goal, _) = messages::read_goal(bytes)?;
         let id = short(&goal.id);
-        let client = (client != self.own).then(|| client.to_owned());
+        let sender = match client == self.own {
+            true => Sender::Inside,
+            false => Sender::Node(client.to_owned()),
+        };
         let mut all = self.all.lock();
         // Its result may have been heard first: they come over two connections.
         let known = all
@@ -143,13 +182,15 @@ impl Heard {
             .rev()
             .find(|goal| goal.id == id && goal.action == action);
         match known {
-            Some(goal) => goal.client = client,
+            // Who was heard to send it first; what an id says counts where nobody was.
+            Some(goal) if matches!(goal.sender, Sender::Node(_)) => {}
+            Some(goal) => goal.sender = sender,
             None => remember(
                 &mut all,
                 Goal {
                     action,
                     id,
-                    client,
+                    sender,
                     began: now(),
                     ended: None,
                 },
@@ -161,12 +202,15 @@ impl Heard {
     fn answered(&self, action: &str, bytes: &Bytes) -> Option<()> {
         let (state, _) = messages::read_state(bytes)?;
         let id = short(&state.goal.id);
+        let mut all = self.all.lock();
+        let time = now();
+        let number = *self.ended.borrow() + 1;
         let outcome = Outcome {
             status: state.status,
             text: short(&state.text),
+            number,
         };
-        let ended = Some((now(), outcome));
-        let mut all = self.all.lock();
+        let ended = Some((time, outcome));
         let open = all
             .iter_mut()
             .rev()
@@ -175,21 +219,40 @@ impl Heard {
             // A result that is latched comes again with each connection.
             Some(goal) if goal.ended.is_some() => return None,
             Some(goal) => goal.ended = ended,
-            None => remember(
-                &mut all,
-                Goal {
-                    action: action.to_owned(),
-                    id,
-                    client: None,
-                    began: now(),
-                    ended,
-                },
-            ),
+            None => {
+                let sender = match is_of(&state.goal.id, &self.own) {
+                    true => Sender::Inside,
+                    false => Sender::Unheard,
+                };
+                remember(
+                    &mut all,
+                    Goal {
+                        action: action.to_owned(),
+                        id,
+                        sender,
+                        began: time,
+                        ended,
+                    },
+                );
+            }
         }
-        drop(all);
-        self.ended.send_modify(|count| *count += 1);
+        self.ended.send_replace(number);
         Some(())
     }
+}
+
+/// Whether a goal's id is one that actionlib's clients make, and this node has: NODE-NUMBER-SECONDS.NANOSECONDS.
+fn is_of(id: &str, node: &str) -> bool {
+    let rest = id
+        .strip_prefix(node)
+        .and_then(|rest| rest.strip_prefix('-'));
+    let parts = rest.and_then(|rest| {
+        let (number, time) = rest.split_once('-')?;
+        let (seconds, nanoseconds) = time.split_once('.')?;
+        Some([number, seconds, nanoseconds])
+    });
+    let is_number = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit());
+    !node.is_empty() && parts.is_some_and(|parts| parts.into_iter().all(is_number))
 }
 
 fn short(text: &str) -> String {
@@ -254,10 +317,11 @@ mod tests {
             outcome,
             Outcome {
                 status: Status::Succeeded,
-                text: "there".into()
+                text: "there".into(),
+                number: 1
             }
         );
-        assert_eq!(all[0].client.as_deref(), Some("/rover"));
+        assert_eq!(all[0].sender, Sender::Node("/rover".into()));
         assert_eq!((all.len(), &all[1].ended), (2, &None));
         assert_eq!(*heard.ended.borrow(), 1);
     }
@@ -269,8 +333,54 @@ mod tests {
         heard.sent("/dock".into(), &goal("a-1"), "/rover");
         heard.answered("/dock", &result("own", Status::Succeeded, ""));
         let all = heard.all.lock();
-        let clients: Vec<_> = all.iter().map(|goal| goal.client.as_deref()).collect();
-        assert_eq!(clients, [Some("/rover"), None]);
+        let senders: Vec<_> = all.iter().map(|goal| goal.sender.clone()).collect();
+        assert_eq!(senders, [Sender::Node("/rover".into()), Sender::Unheard]);
+        assert_eq!(
+            all[1].ended.as_ref().map(|(time, _)| *time),
+            Some(all[1].began)
+        );
+    }
+
+    #[test]
+    fn this_sides_goals_are_known_by_their_ids_and_others_are_not_taken_for_them() {
+        let heard = heard();
+        for (id, sender) in [
+            ("/inside-3-17.000000005", Sender::Inside),
+            ("/inside", Sender::Unheard),
+            ("/inside-", Sender::Unheard),
+            ("/inside-3-17", Sender::Unheard),
+            ("/inside_too-3-17.5", Sender::Unheard),
+            ("/inside-too-3-17.5", Sender::Unheard),
+            ("/rover-3-17.5", Sender::Unheard),
+            ("", Sender::Unheard),
+        ] {
+            heard.answered("/dock", &result(id, Status::Succeeded, ""));
+            let all = heard.all.lock();
+            assert_eq!(all.back().map(|goal| &goal.sender), Some(&sender), "{id}");
+        }
+        // Who says so and is heard is not believed.
+        heard.sent("/dock".into(), &goal("/inside-3-17.000000005"), "/rover");
+        let first = heard.all.lock()[0].sender.clone();
+        assert_eq!(first, Sender::Node("/rover".into()));
+    }
+
+    #[test]
+    fn each_that_has_ended_is_told_in_turn() {
+        let heard = heard();
+        for id in ["a", "b", "c"] {
+            heard.sent("/dock".into(), &goal(id), "/rover");
+        }
+        for id in ["b", "a"] {
+            heard.answered("/dock", &result(id, Status::Succeeded, ""));
+        }
+        let ids = |number| -> Vec<String> {
+            let ended = heard.ended_after(number).into_iter();
+            ended.map(|goal| goal.id).collect()
+        };
+        assert_eq!(ids(0), ["b", "a"]);
+        assert_eq!(ids(1), ["a"]);
+        heard.answered("/dock", &result("c", Status::Aborted, ""));
+        assert_eq!((ids(2), *heard.ended.borrow()), (vec!["c".to_owned()], 3));
     }
 
     #[test]

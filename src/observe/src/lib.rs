@@ -12,9 +12,10 @@ mod black_box;
 mod figures;
 mod follow;
 mod goals;
+mod numbered;
 mod ring;
 
 pub use black_box::{BlackBox, BoxOptions, Frozen};
 pub use figures::{Figures, TopicFigures};
 pub use follow::{Followed, Seen};
-pub use goals::{Goal, Goals, Outcome};
+pub use goals::{Goal, Goals, Outcome, Sender};

@@ -29,6 +29,10 @@ pub async fn allowed(
     mut request: Request,
     next: Next,
 ) -> Response {
+    if let Err(RawPathParamsRejection::InvalidUtf8InPathParam(unreadable)) = &params {
+        let why = format!("the address cannot be read: {}", unreadable.body_text());
+        return Error::BadRequest(why).into_response();
+    }
     let Access::May(action, of) = route.access else {
         return next.run(request).await;
     };

@@ -118,10 +118,17 @@ pub async fn remove_service(
     Path(name): Path<String>,
 ) -> Answer<Stopped> {
     app.catalogue.current(&name)?;
-    let stopped = app.pusher.remove(&name).await?;
-    // The next of this name may be somebody else's.
-    recordings::forget_service(&app, &name).await?;
-    Ok(Json(Stopped { stopped }))
+    let removed = {
+        let app = Arc::clone(&app);
+        async move {
+            let stopped = app.pusher.remove(&name).await?;
+            // The next of this name may be somebody else's.
+            recordings::forget_service(&app, &name).await?;
+            Ok(Json(Stopped { stopped }))
+        }
+    };
+    let removed = recordings::to_its_end(&app.sessions, removed).await;
+    removed.unwrap_or(Err(Error::Internal("removing a service")))
 }
 
 /// Makes an earlier revision the current one.

@@ -9,6 +9,8 @@ use choreographer::{Refused, Unchanged, Untenable, with_last_words};
 
 use crate::principals::{Uncertified, Uncoded, Unrecognised};
 
+mod next;
+
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -33,6 +35,14 @@ pub enum Error {
     /// Nothing is served there.
     #[error("nothing is served at {path}")]
     UnknownPath {
+        /// Asked for.
+        path: String,
+    },
+    /// Something is served there, by other methods.
+    #[error("{method} is not answered at {path}")]
+    OtherMethod {
+        /// Asked with.
+        method: String,
         /// Asked for.
         path: String,
     },
@@ -165,6 +175,14 @@ pub enum Error {
         /// Why.
         reason: String,
     },
+    /// A file of a servant's last seconds was taken a moment ago.
+    #[error("the last seconds of servant {servant} were recorded a moment ago")]
+    RecordedLately {
+        /// Whose.
+        servant: String,
+        /// In so many seconds again.
+        again: u64,
+    },
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
@@ -223,8 +241,7 @@ impl Error {
         match self.log() {
             Some(log) => with_last_words(&self.to_string(), log),
             None if self.is_of_terms() => {
-                let next = self.next().unwrap_or_default();
-                format!("{self}; {next}")
+                format!("{self}; {}", self.next())
             }
             None => self.to_string(),
         }
@@ -270,7 +287,6 @@ const INTERNAL: Kind = (
     "the daemon failed",
 );
 const ENDING: Kind = (StatusCode::SERVICE_UNAVAILABLE, "ending", "daemon ending");
-const NEXT_OF_ENDING: &str = "ask again when the daemon has started again";
 
 impl Error {
     /// The problem that a client is told.
@@ -281,7 +297,7 @@ impl Error {
             title: title.to_owned(),
             status: status.as_u16(),
             detail: self.to_string(),
-            next: self.next(),
+            next: Some(self.next()),
             ..Problem::default()
         };
         if let Error::UnknownRobot { exists, .. }
@@ -323,6 +339,7 @@ impl Error {
             (_, Some(choreographer::Error::BackOff { again, .. })) => {
                 choreographer::seconds(*again)
             }
+            (Error::RecordedLately { again, .. }, _) => *again,
             _ => RETRY_AFTER,
         };
         problem.retry_after = again.contains(&status).then_some(after);
@@ -367,6 +384,9 @@ impl Error {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownRow { .. } => (S::NOT_FOUND, "unknown-row", "unknown row"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
+            Error::OtherMethod { .. } => {
+                (S::METHOD_NOT_ALLOWED, "other-method", "method not answered")
+            }
             Error::BodyTooLarge { .. } | Error::TrialTooLarge { .. } => {
                 (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
             }
@@ -401,6 +421,11 @@ impl Error {
             Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "nothing is kept"),
             Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
             Error::NotRecorded { .. } => (S::INSUFFICIENT_STORAGE, "not-recorded", "not recorded"),
+            Error::RecordedLately { .. } => (
+                S::TOO_MANY_REQUESTS,
+                "recorded-lately",
+                "recorded a moment ago",
+            ),
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
                 (S::SERVICE_UNAVAILABLE, "busy", "too many sign in")
             }
@@ -437,88 +462,6 @@ impl Error {
             Error::State(_) | Error::Image(_) | Error::Internal(_) => INTERNAL,
         }
     }
-
-    fn next(&self) -> Option<String> {
-        let text = match self {
-            Error::UnknownRobot { .. } => {
-                "see those that are served with: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub doctor".into()
-            }
-            Error::Unstatable(_) => "see what can be stated in docs/robots.md".into(),
-            Error::UnknownRow { service, .. } => {
-                format!("see those that exist with: cloudroidctl sla list {service}")
-            }
-            Error::Forbidden { .. } => {
-                "show a token that may (an admin makes one with: cloudroidctl token create), or ask at the daemon's socket, as root".into()
-            }
-            Error::UnknownToken { .. } => "see those that exist with: cloudroidctl token list".into(),
-            Error::TokenExists(name) => format!(
-                "choose another name, give it another secret with: cloudroidctl token rotate {name}, or end it with: cloudroidctl token revoke {name}"
-            ),
-            Error::UnknownAccount { .. } => "see those that exist with: cloudroidctl account list".into(),
-            Error::AccountExists(name) => format!(
-                "choose another name, or remove it with: cloudroidctl account remove {name}"
-            ),
-            Error::WrongPassword => {
-                "try again, or have an admin set another password with: cloudroidctl account passwd NAME".into()
-            }
-            Error::SignInBusy => "try again later".into(),
-            Error::TooManyStreams { .. } => {
-                "close pages of the portal that are open elsewhere, then load this one again".into()
-            }
-            Error::TooManyLook { .. } => {
-                "close pages that look into it elsewhere, then try again".into()
-            }
-            Error::NotThereYet(id) => {
-                format!("see its state with: cloudroidctl servants, or GET /api/v1/servants/{id}; try again when it is ready")
-            }
-            Error::NoBlackBox(_) => {
-                "have an operator set seconds of [black_box] in the configuration (docs/viewers.md); where it is set, a servant is listened to a second after it is ready".into()
-            }
-            Error::UnknownRecording(_) => "see those that exist with: cloudroidctl recordings list".into(),
-            Error::NotRecorded { .. } => {
-                "make room on the disk of the state directory, or lower disk of [black_box] in the configuration; then: cloudroidctl recordings take SERVANT".into()
-            }
-            Error::NoProvider => "sign in with an account, or have [oidc] configured (docs/access.md)".into(),
-            Error::Provider(error) => error.next().into(),
-            Error::NoRole { .. } => {
-                "have an operator name one of them in roles of [oidc] in the configuration (docs/access.md), or the provider put you into one that is; then sign in again".into()
-            }
-            Error::UnknownRule { .. } => "see those that exist with: cloudroidctl policy list".into(),
-            Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
-            Error::Unrecognised(Unrecognised::Slowed(_)) => {
-                "ask again then; tokens made by cloudroidctl token create are looked at always".into()
-            }
-            Error::Unrecognised(Unrecognised::SlowedSignIn(_)) => {
-                "try again then; who is signed in stays so, and root and the group cloudroid need no password at the daemon's sockets".into()
-            }
-            Error::Unrecognised(Unrecognised::SessionOver) => "sign in again".into(),
-            Error::Unauthorised(_) | Error::Unrecognised(_) => {
-                "send a token that the operator gave you: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
-            }
-            Error::Uncertified(_) | Error::Uncoded(_) => {
-                "have it paired: on the server cloudroidctl pair ROBOT, on the robot cloudroid-stub pair 'LINE'".into()
-            }
-            Error::UnknownPairing { .. } => "see those that there are with: cloudroidctl pair --list".into(),
-            Error::PlainText { instead } => format!(
-                "use {instead}; what was sent, such as a token, could be read by anybody on the way"
-            ),
-            Error::Foreign { next, .. } => next.clone(),
-            Error::RobotTaken(_) => "connect with that token, or under another name".into(),
-            Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the configuration".into(),
-            Error::BodyTooLarge { .. } => "send less in one request".into(),
-            Error::Unfinished { .. } => {
-                "send it over a faster connection, or raise unfinished in [memory] of the configuration".into()
-            }
-            Error::TrialTooLarge { .. } => {
-                "send a shorter one, or raise client and daemon in [memory] of the configuration; 512M is the most".into()
-            }
-            Error::Push(error) => return next_of_push(error),
-            Error::Choreographer(error) => return next_of_choreographer(error),
-            Error::Catalogue(error) => return next_of_catalogue(error),
-            _ => return None,
-        };
-        Some(text)
-    }
 }
 
 fn kind_of_provider(error: &oidc::Error) -> Kind {
@@ -550,27 +493,6 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::Engine(error) => kind_of_engine(error),
         P::State(_) | P::Image(_) | P::Internal(_) => INTERNAL,
     }
-}
-
-fn next_of_push(error: &push::Error) -> Option<String> {
-    use push::Error as P;
-    let text = match error {
-        P::NotAllowed(_) => "choose another name with --name, or ask its owner".into(),
-        P::NameTaken { name, .. } => {
-            format!(
-                "choose another name with --name, or remove the service with: cloudroidctl rm {name}"
-            )
-        }
-        P::Failed { next, .. } => return next.clone(),
-        P::TooLarge { .. } => {
-            "leave out what is not needed, or raise archive in [push] of the configuration".into()
-        }
-        P::Choreographer(error) => return next_of_choreographer(error),
-        P::Catalogue(error) => return next_of_catalogue(error),
-        P::Ending => NEXT_OF_ENDING.into(),
-        _ => return None,
-    };
-    Some(text)
 }
 
 fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
@@ -609,47 +531,6 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
     }
 }
 
-fn next_of_choreographer(error: &choreographer::Error) -> Option<String> {
-    use choreographer::Error as C;
-    let text = match error {
-        C::UnknownServant { .. } => "see those that exist with: cloudroidctl servants".into(),
-        C::Full(Refused::TooBig { .. }) => "push it with smaller --cpus and --memory".into(),
-        C::Terms(untenable) => next_of_terms(untenable),
-        C::NotResized { reason, .. } => match &**reason {
-            Unchanged::Untenable(untenable) => next_of_terms(untenable),
-            Unchanged::Full(Refused::NoMore { free, .. }) => format!(
-                "state what fits: cpus={} memory={}; it keeps what it has until then",
-                free.cpus(),
-                api::Size(free.memory)
-            ),
-            Unchanged::Full(_) => "try again later; it keeps what it has until then".into(),
-            Unchanged::Used { used, .. } => {
-                format!("state memory={used} or more, or end it with: cloudroidctl stop")
-            }
-            Unchanged::Many => {
-                "let these stubs state nothing, or end the servant with: cloudroidctl stop".into()
-            }
-        },
-        C::Full(_) => "try again later, end servants (cloudroidctl stop), or raise [capacity] in the configuration".into(),
-        C::Place { service, .. } => format!(
-            "name one of the servants of {service}, which are named ~group- where a robot's name stands: cloudroidctl servants"
-        ),
-        C::Servant { service, .. } => {
-            format!("see cloudroidctl events, and push {service} again when its package is fixed")
-        }
-        C::NoRollout(service) => format!(
-            "push a revision with --canary or --deadline, or begin with one: cloudroidctl rollout {service} start REVISION --canary 10%"
-        ),
-        C::BackOff { service, .. } => {
-            format!("see why with: cloudroidctl events; push {service} again when its package is fixed: a new revision is started at once")
-        }
-        C::Catalogue(error) => return next_of_catalogue(error),
-        C::Ending => NEXT_OF_ENDING.into(),
-        _ => return None,
-    };
-    Some(text)
-}
-
 fn kind_of_terms(untenable: &Untenable) -> Kind {
     use StatusCode as S;
     match untenable {
@@ -658,37 +539,6 @@ fn kind_of_terms(untenable: &Untenable) -> Kind {
             (S::FORBIDDEN, "capped", "more than is allowed")
         }
         Untenable::Unmet { .. } => (S::UNPROCESSABLE_ENTITY, "unmet", "cannot be reached"),
-    }
-}
-
-fn next_of_terms(untenable: &Untenable) -> String {
-    match untenable {
-        Untenable::UnknownClass { exists, .. } if exists.is_empty() => {
-            "state none, or have the operator add it: [class.NAME] of the configuration".into()
-        }
-        Untenable::UnknownClass { .. } => {
-            "state one that exists, or have the operator add it: [class.NAME] of the configuration"
-                .into()
-        }
-        Untenable::Capped { cap, .. } => {
-            format!("state {}={} or less", cap.resource, cap.most)
-        }
-        Untenable::Beyond { assumed, fits, .. } if !assumed.is_empty() => {
-            let keys: Vec<String> = assumed.keys().map(|key| format!("aux.{key}")).collect();
-            let fits = fits.as_ref().map(|fits| format!(", or what fits: {fits}"));
-            let keys = keys.join(" and ");
-            format!("state {keys}{}", fits.unwrap_or_default())
-        }
-        Untenable::Beyond {
-            fits: Some(fits), ..
-        }
-        | Untenable::Unmet {
-            fits: Some(fits), ..
-        } => format!("state what fits: {fits}"),
-        Untenable::Beyond { .. } => "state less, or have the operator raise the cap".into(),
-        Untenable::Unmet { service, .. } => format!(
-            "state resources outright (cpus, memory), or have the deployer add a row: cloudroidctl sla set {service}"
-        ),
     }
 }
 
@@ -716,27 +566,6 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
         C::Inventory(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
         C::State(_) | C::Image(_) | C::Internal(_) => INTERNAL,
     }
-}
-
-fn next_of_catalogue(error: &catalogue::Error) -> Option<String> {
-    use catalogue::Error as C;
-    let text = match error {
-        C::UnknownService { exists, .. } if exists.is_empty() => {
-            "publish one with: cloudroidctl push".to_owned()
-        }
-        C::UnknownService { .. } => {
-            "use one that exists, or publish it with: cloudroidctl push".to_owned()
-        }
-        C::UnknownRevision { service, .. } => {
-            format!("see those that exist with: cloudroidctl services {service}")
-        }
-        C::NoStub { service, .. } => format!("fix the package and push {service} again"),
-        C::UnknownArchitecture { .. } => {
-            "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".to_owned()
-        }
-        _ => return None,
-    };
-    Some(text)
 }
 
 impl IntoResponse for Error {

@@ -9,7 +9,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use access::{Action, Refusal, Role};
+use access::{Action, Grants, Refusal, Role, Standing};
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
@@ -94,10 +94,24 @@ pub enum Part {
     Looks,
 }
 
-/// What the caller, who sees the servant, may do inside. A robot is let in where it may be that robot, and nowhere else.
-fn part(app: &App, caller: &Caller, handle: &Handle) -> Result<Part, Error> {
+/// Whose servants are looked into, or what is kept of them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Whose<'a> {
+    pub service: &'a str,
+    pub robot: &'a str,
+    /// In words: servant, or recording.
+    pub object: std::fmt::Arguments<'a>,
+}
+
+/// What the caller, who sees the service, may do inside a robot's servants there. A robot is let in where it may be that robot, and nowhere
+/// else.
+pub(crate) fn part(app: &App, caller: &Caller, whose: Whose<'_>) -> Result<Part, Error> {
     let principal = &caller.who.principal;
-    let (service, robot) = (handle.service(), handle.robot.as_str());
+    let Whose {
+        service,
+        robot,
+        object,
+    } = whose;
     if caller.may_at(app, Action::Operate, service, None).is_ok() {
         return Ok(Part::Acts);
     }
@@ -115,10 +129,19 @@ fn part(app: &App, caller: &Caller, handle: &Handle) -> Result<Part, Error> {
     match (connects, principal.is(Role::Viewer)) {
         (Ok(()), _) if own => Ok(Part::Acts),
         (_, true) => Ok(Part::Looks),
-        _ => {
-            let object = format_args!("servant {}", handle.id);
-            Err(Refusal::new(principal, Action::See, object).into())
-        }
+        _ => Err(Refusal::new(principal, Action::See, object).into()),
+    }
+}
+
+/// What the caller may use of what flows inside them now.
+pub(crate) fn grants(app: &App, caller: &Caller, whose: Whose<'_>) -> Result<Arc<Grants>, Error> {
+    let part = part(app, caller, whose)?;
+    let standing = app
+        .principals
+        .standing_inside(&caller.who, whose.service, part);
+    match standing {
+        Standing::Granted(grants) => Ok(grants),
+        Standing::Ended(reason) => Err(Error::Forbidden { what: reason }),
     }
 }
 
@@ -151,7 +174,12 @@ impl Door {
     /// Of the servant of this id.
     pub fn of(app: &Arc<App>, id: &str, caller: Caller) -> Result<Self, Error> {
         let handle = app.choreographer.servant(id)?;
-        let part = part(app, &caller, &handle)?;
+        let whose = Whose {
+            service: handle.service(),
+            robot: &handle.robot,
+            object: format_args!("servant {id}"),
+        };
+        let part = part(app, &caller, whose)?;
         Ok(Self {
             app: Arc::clone(app),
             handle,

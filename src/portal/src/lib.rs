@@ -88,6 +88,7 @@ pub fn router(app: Arc<App>) -> Router {
     });
     served
         .fallback(routes::nothing)
+        .method_not_allowed_fallback(routes::other_method)
         .layer(axum::middleware::from_fn_with_state(
             Arc::clone(&app),
             guard::guard,

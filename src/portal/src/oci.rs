@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
-use axum::http::{HeaderName, StatusCode, header};
+use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde_json::json;
@@ -168,6 +168,18 @@ pub async fn nothing(OriginalUri(uri): OriginalUri) -> Response {
         StatusCode::NOT_FOUND,
         "UNSUPPORTED",
         &format!("{} is not served; images are read-only here", uri.path()),
+    )
+}
+
+/// The same of a path that is served by another method.
+pub fn other_method(method: &Method, uri: &Uri) -> Response {
+    refused(
+        StatusCode::METHOD_NOT_ALLOWED,
+        "UNSUPPORTED",
+        &format!(
+            "{method} is not answered at {}; images are read-only here",
+            uri.path()
+        ),
     )
 }
 

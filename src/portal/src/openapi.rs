@@ -1,5 +1,6 @@
 //! The OpenAPI document of `/api/v1`, made of the table of routes and of the types of crate `api`.
 
+use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
 use api::NDJSON;
@@ -21,7 +22,7 @@ use utoipa::openapi::security::{
 use utoipa::openapi::{
     InfoBuilder, OpenApi, OpenApiBuilder, Ref, RefOr, Required, ResponseBuilder, Server,
 };
-use utoipa::{IntoParams, ToSchema};
+use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 use crate::errors::Error;
 use crate::routes::{Access, ROUTES, Route};
@@ -30,29 +31,80 @@ use crate::routes::{Access, ROUTES, Route};
 const BASE: &str = "/api/v1";
 const JSON: &str = "application/json";
 const EVENT_STREAM: &str = "text/event-stream";
+const HTML: &str = "text/html";
 const ABOUT: &str = "What cloudroidctl and the portal's page ask of cloudroidd. Robots connect elsewhere: \
                      ws://host:port/SERVICE?robot=ID speaks rosbridge v2. Images are served read-only at /v2/ (OCI \
                      distribution).";
 
 type AnySchema = RefOr<Schema>;
 
+/// What a refusal of each status says, in a few words.
+const REFUSED: &[(u16, &str)] = &[
+    (400, "Something in the request is not what it should be."),
+    (401, "Nobody is known who asks."),
+    (403, "Who asks may not."),
+    (
+        404,
+        "There is no such thing; exists names those that there are.",
+    ),
+    (408, "The body was not complete in time."),
+    (409, "It stands against what is there now."),
+    (413, "The body is too big."),
+    (422, "It cannot be, whenever it is asked."),
+    (426, "The WebSocket handshake is of another version."),
+    (429, "Too many; Retry-After says when to ask again."),
+    (500, "The daemon failed."),
+    (502, "Whoever was asked in turn did not answer."),
+    (503, "Not now; Retry-After says when to ask again."),
+    (507, "There is no room on the disk."),
+];
+/// With what any operation may be refused.
+const ANY: &[u16] = &[400, 401, 403, 429, 500];
+/// One of something that the address names.
+const NAMED: &[u16] = &[404];
+/// One whose body is read first.
+const WITH_BODY: &[u16] = &[408, 413, 503];
+/// Operations that may be refused with more, by their ids.
+const MORE: &[(&str, &[u16])] = &[
+    ("calibrate", &[409]),
+    ("createAccount", &[409]),
+    ("createToken", &[409]),
+    ("explainSla", &[422]),
+    ("fit", &[422]),
+    ("inside", &[409, 426]),
+    ("logs", &[409]),
+    ("oidcCallback", &[404, 502, 503]),
+    ("oidcLogin", &[404, 502, 503]),
+    ("orderRollout", &[409]),
+    ("push", &[409, 422]),
+    ("removeService", &[503]),
+    ("rollback", &[409]),
+    ("setLimits", &[409, 422, 502]),
+    ("stopServants", &[404]),
+    ("takeRecording", &[409, 507]),
+    ("topics", &[409]),
+    ("trial", &[422, 502]),
+];
+
 /// One method at one address, in words and schemas.
 pub struct Operation {
+    id: String,
     built: OperationBuilder,
+    reads_body: bool,
     /// Schemas that it refers to, by name.
     schemas: Vec<(String, AnySchema)>,
 }
 
 /// An operation: its id, by which generators of clients call it, and what it does.
 pub fn operation(id: &str, summary: &str) -> Operation {
-    let mut operation = Operation {
+    Operation {
+        id: id.to_owned(),
         built: OperationBuilder::new()
             .operation_id(Some(id))
             .summary(Some(summary)),
+        reads_body: false,
         schemas: Vec::new(),
-    };
-    let problem = operation.named::<Problem>();
-    operation.answer("default", "Refused.", PROBLEM_JSON, problem)
+    }
 }
 
 impl Operation {
@@ -101,6 +153,13 @@ impl Operation {
         self
     }
 
+    /// It answers that it was done.
+    pub fn answers_nothing(mut self) -> Self {
+        let response = ResponseBuilder::new().description("Done.");
+        self.built = self.built.response("204", response);
+        self
+    }
+
     /// It becomes a WebSocket.
     pub fn becomes_a_websocket(mut self) -> Self {
         let response = ResponseBuilder::new().description("A WebSocket from here on.");
@@ -109,9 +168,12 @@ impl Operation {
     }
 
     /// It answers a page for people.
-    pub fn answers_page(self) -> Self {
-        let text = ObjectBuilder::new().schema_type(Type::String);
-        self.answer("200", "As asked.", "text/html", text.into())
+    pub fn answers_page(mut self) -> Self {
+        let response = ResponseBuilder::new()
+            .description("As asked.")
+            .content(HTML, page());
+        self.built = self.built.response("200", response);
+        self
     }
 
     /// It reads these from the query.
@@ -165,6 +227,7 @@ impl Operation {
             .content(media, Content::new(Some(schema)))
             .required(Some(required));
         self.built = self.built.request_body(Some(body.build()));
+        self.reads_body = true;
         self
     }
 
@@ -184,10 +247,55 @@ impl Operation {
     }
 }
 
+/// With what an operation at this path may be refused.
+fn refusals(path: &str, operation: &Operation) -> BTreeSet<u16> {
+    let named = if path.contains('{') { NAMED } else { &[] };
+    let body = if operation.reads_body { WITH_BODY } else { &[] };
+    let more = MORE.iter().filter(|(id, _)| *id == operation.id);
+    let more = more.flat_map(|(_, statuses)| *statuses);
+    let all = ANY.iter().chain(named).chain(body).chain(more);
+    all.copied().collect()
+}
+
+/// The name of the response that all refusals of a status are.
+fn name_of_refusal(status: u16) -> String {
+    format!("Refused{status}")
+}
+
+/// A refusal: a problem; where a browser was sent, a page for its person if it asks for one.
+fn refusal(words: &str, is_page: bool) -> utoipa::openapi::Response {
+    let problem = Content::new(Some(Ref::from_schema_name(Problem::name())));
+    let response = ResponseBuilder::new()
+        .description(words)
+        .content(PROBLEM_JSON, problem);
+    match is_page {
+        true => response.content(HTML, page()).build(),
+        false => response.build(),
+    }
+}
+
+/// A page for people.
+fn page() -> Content {
+    let text = ObjectBuilder::new().schema_type(Type::String);
+    Content::new(Some(Schema::from(text.build())))
+}
+
 /// Describes those routes that have an operation.
 fn document(routes: &[Route]) -> OpenApi {
     let mut paths = Paths::new();
     let mut components = Components::new();
+    let (problem, mut schemas) = (Problem::schema(), Vec::new());
+    Problem::schemas(&mut schemas);
+    components.schemas.extend(schemas);
+    components
+        .schemas
+        .insert(Problem::name().into_owned(), problem);
+    for (status, words) in REFUSED {
+        let all = refusal(words, false);
+        components
+            .responses
+            .insert(name_of_refusal(*status), all.into());
+    }
     for route in routes {
         let (Some(operation), Some(path), Some(method)) = (
             route.operation,
@@ -196,7 +304,24 @@ fn document(routes: &[Route]) -> OpenApi {
         ) else {
             continue;
         };
-        let Operation { mut built, schemas } = operation();
+        let operation = operation();
+        let statuses = refusals(path, &operation);
+        let Operation {
+            mut built, schemas, ..
+        } = operation;
+        for (status, words) in REFUSED {
+            if !statuses.contains(status) {
+                continue;
+            }
+            // Browsers alone are sent there.
+            built = match path.starts_with("/oidc/") {
+                true => built.response(status.to_string(), refusal(words, true)),
+                false => {
+                    let all = Ref::from_response_name(name_of_refusal(*status));
+                    built.response(status.to_string(), all)
+                }
+            };
+        }
         for parameter in named_in(path) {
             built = built.parameter(parameter);
         }

@@ -2,7 +2,7 @@
 //! compressed for a request.
 
 use axum::extract::Path;
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, header};
 use axum::response::{IntoResponse, Response};
 use include_dir::{Dir, include_dir};
 
@@ -27,11 +27,12 @@ const ENCODINGS: [(&str, &str); 2] = [("br", ".br"), ("gzip", ".gz")];
 /// `/`.
 pub fn index(method: &Method, headers: &HeaderMap) -> Response {
     if !matches!(*method, Method::GET | Method::HEAD) {
-        return (
-            StatusCode::METHOD_NOT_ALLOWED,
-            [(header::ALLOW, "GET, HEAD")],
-        )
-            .into_response();
+        let refusal = Error::OtherMethod {
+            method: method.to_string(),
+            path: "/".to_owned(),
+        };
+        let allowed = [(header::ALLOW, "GET, HEAD")];
+        return (allowed, refusal).into_response();
     }
     match file(INDEX, headers, "no-cache") {
         Some(page) => page,
@@ -118,6 +119,8 @@ fn kind(path: &str) -> &'static str {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::StatusCode;
+
     use super::*;
 
     fn headers(accepts: &str) -> HeaderMap {

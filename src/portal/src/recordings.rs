@@ -5,7 +5,7 @@ use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use access::Action;
+use access::{Action, Grants, Operation};
 use api::recordings::Recording;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -13,16 +13,20 @@ use axum::http::{HeaderValue, header};
 use axum::response::Response;
 use axum::{Extension, Json};
 use choreographer::Handle;
+use futures_util::StreamExt;
 use recording::Writer;
 use serde::Deserialize;
 use store::{NewEvent, RecordingRecord};
 use tokio_util::io::ReaderStream;
+use tokio_util::task::TaskTracker;
 use utoipa::IntoParams;
 
 use crate::api_v1::Answer;
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
+use crate::inside::{self, Whose};
+use crate::observers::BlackBoxOptions;
 use crate::query::Query;
 
 /// Where files are, below the state directory.
@@ -55,7 +59,7 @@ pub fn about(handle: &Handle) -> NewEvent<'_> {
     }
 }
 
-/// Writes what is kept of a servant into a file.
+/// Writes what is kept of a servant into a file. To be awaited to its end: else the next one would begin while this one is written.
 pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recording, Error> {
     let Some(kept) = app.observers.black_box(&handle.id) else {
         return Err(Error::NoBlackBox(handle.id.clone()));
@@ -75,8 +79,7 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
     let frozen = match written {
         Ok(Ok(frozen)) => frozen,
         error => {
-            let path = half.clone();
-            let _ = privileged(move || std::fs::remove_file(path)).await;
+            remove_file(half).await;
             return Err(failed(match error {
                 Ok(Err(error)) => error.to_string(),
                 _ => "the daemon's task broke".to_owned(),
@@ -93,9 +96,15 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
         span: u64::try_from(frozen.span.as_millis()).unwrap_or(u64::MAX),
         messages: frozen.summary.messages,
         bytes: frozen.summary.size,
+        topics: Some(frozen.topics),
     };
-    make_room(app, record.bytes).await?;
-    record.id = app.state.add_recording(&record)?;
+    match admit(app, handle, &record).await {
+        Ok(number) => record.id = number,
+        Err(error) => {
+            remove_file(half).await;
+            return Err(error);
+        }
+    }
     let whole = path_of(app, record.id);
     if let Err(error) = privileged(move || std::fs::rename(half, whole)).await {
         app.state.forget_recording(record.id)?;
@@ -114,6 +123,66 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
     let journal = app.choreographer.journal();
     journal.info(RECORDED, &words, &about(handle));
     Ok(told(record))
+}
+
+/// Makes room for a new file, and remembers it; its number. Its service may have been removed while it was written, and another may be of that
+/// name by now: whose servant is gone, of that nothing is kept.
+async fn admit(app: &App, handle: &Handle, record: &RecordingRecord) -> Result<u64, Error> {
+    let now = app.choreographer.servant(&handle.id)?;
+    let is_published = app.state.service_package(handle.service())?.is_some();
+    if !is_published || !std::ptr::eq(Arc::as_ptr(&now), handle) {
+        return Err(Error::NotThereYet(handle.id.clone()));
+    }
+    let options = &app.options.black_box;
+    if record.bytes > options.disk {
+        return Err(Error::NotRecorded {
+            servant: handle.id.clone(),
+            reason: format!(
+                "the file has {}, and all of them may have {} (disk of [black_box])",
+                api::Size(record.bytes),
+                api::Size(options.disk)
+            ),
+        });
+    }
+    let known = app.state.recordings()?;
+    for number in in_the_way(&known, record, options) {
+        forget(app, number).await?;
+    }
+    Ok(app.state.add_recording(record)?)
+}
+
+/// The files that go for a new one, among those that there are, the newest first: of the service that takes most, the new one counted, the
+/// oldest. However many files come of a service, they drive out none of those that take less.
+fn in_the_way(
+    known: &[RecordingRecord],
+    new: &RecordingRecord,
+    options: &BlackBoxOptions,
+) -> Vec<u64> {
+    let mut left: Vec<&RecordingRecord> = known.iter().collect();
+    let mut gone = Vec::new();
+    loop {
+        let sum: u64 = left.iter().map(|one| one.bytes).sum();
+        let many = left.len() >= options.files;
+        if !many && sum.saturating_add(new.bytes) <= options.disk {
+            return gone;
+        }
+        let taken = |service: &str| {
+            let all = left.iter().copied().chain([new]);
+            all.filter(|one| one.service == service)
+                .map(|one| if many { 1 } else { one.bytes })
+                .sum::<u64>()
+        };
+        // Of equals its own.
+        let most = left
+            .iter()
+            .map(|one| one.service.as_str())
+            .max_by_key(|service| (taken(service), *service == new.service));
+        let oldest = left.iter().rposition(|one| Some(&*one.service) == most);
+        let Some(oldest) = oldest else {
+            return gone;
+        };
+        gone.push(left.remove(oldest).id);
+    }
 }
 
 fn directory(app: &App) -> PathBuf {
@@ -143,32 +212,22 @@ fn make(path: &std::path::Path) -> io::Result<File> {
     options.write(true).create(true).truncate(true).open(path)
 }
 
-/// Removes the oldest files until there is room for one more of this size.
-async fn make_room(app: &App, bytes: u64) -> Result<(), Error> {
-    let options = &app.options.black_box;
-    let mut known = app.state.recordings()?;
-    let mut sum: u64 = known.iter().map(|one| one.bytes).sum();
-    while let Some(oldest) = known.last()
-        && (known.len() >= options.files || sum.saturating_add(bytes) > options.disk)
-    {
-        forget(app, oldest.id).await?;
-        sum -= oldest.bytes;
-        known.pop();
-    }
-    Ok(())
+async fn remove_file(path: PathBuf) {
+    let _ = privileged(move || std::fs::remove_file(path)).await;
 }
 
 async fn forget(app: &App, number: u64) -> Result<(), Error> {
     // Forgotten first: what is listed is there.
     if app.state.forget_recording(number)? {
-        let path = path_of(app, number);
-        let _ = privileged(move || std::fs::remove_file(path)).await;
+        remove_file(path_of(app, number)).await;
     }
     Ok(())
 }
 
-/// Removes those of a service.
+/// Removes those of a service, which is there no more.
 pub async fn forget_service(app: &App, service: &str) -> Result<(), Error> {
+    // One that is being written is forgotten, too.
+    let _turn = app.observers.writing.lock().await;
     let mut all = app.state.recordings()?;
     all.retain(|one| one.service == service);
     for one in all {
@@ -177,11 +236,16 @@ pub async fn forget_service(app: &App, service: &str) -> Result<(), Error> {
     Ok(())
 }
 
-/// Removes files that nobody knows of: of a daemon that was killed in between.
+/// Removes files that nobody knows of, and those of services that there are not: of a daemon that was killed in between.
 pub async fn sweep(app: &App) {
-    let Ok(known) = app.state.recordings() else {
+    let _turn = app.observers.writing.lock().await;
+    let Ok(mut known) = app.state.recordings() else {
         return;
     };
+    known.retain(|one| {
+        let is_gone = matches!(app.state.service_package(&one.service), Ok(None));
+        !(is_gone && app.state.forget_recording(one.id).is_ok())
+    });
     let directory = directory(app);
     let swept = privileged(move || {
         for file in std::fs::read_dir(directory)?.flatten() {
@@ -211,10 +275,45 @@ fn told(record: RecordingRecord) -> Recording {
     }
 }
 
-/// Those that the caller may see, the newest first.
+/// Refuses a file to who may not hear all that is in it: what somebody may not hear inside the robot's servants, it may not have later.
+fn check_heard(app: &App, caller: &Caller, record: &RecordingRecord) -> Result<(), Error> {
+    let grants = inside::grants(
+        app,
+        caller,
+        Whose {
+            service: &record.service,
+            robot: &record.robot,
+            object: format_args!("recording {}", record.id),
+        },
+    )?;
+    match &record.topics {
+        Some(topics) if may_hear(&grants, topics) => Ok(()),
+        Some(_) => {
+            let who = &caller.who.principal.name;
+            Err(Error::Forbidden {
+                what: format!(
+                    "recording {} holds topics that {who} may not hear (granted: {grants}); an admin can grant them: cloudroidctl policy allow {who} 'subscribe:/**' --service {}",
+                    record.id, record.service
+                ),
+            })
+        }
+        None => caller.may_at(app, Action::Operate, &record.service, None),
+    }
+}
+
+/// Whether all of these may be heard.
+fn may_hear(grants: &Grants, topics: &[String]) -> bool {
+    let mut all = topics.iter();
+    all.all(|topic| grants.permits(Operation::Subscribe, topic))
+}
+
+/// Those that the caller may have, the newest first.
 fn seen(app: &App, caller: &Caller) -> Result<Vec<RecordingRecord>, Error> {
     let mut all = app.state.recordings()?;
-    all.retain(|one| caller.may_of(app, Action::See, &one.service, &one.robot));
+    all.retain(|one| {
+        caller.may_of(app, Action::See, &one.service, &one.robot)
+            && check_heard(app, caller, one).is_ok()
+    });
     Ok(all)
 }
 
@@ -228,7 +327,7 @@ pub fn known(app: &App, number: &str) -> Result<RecordingRecord, Error> {
     found.ok_or_else(|| Error::UnknownRecording(number.to_owned()))
 }
 
-/// All files that the caller may see, the newest first.
+/// All files that the caller may have, the newest first.
 pub async fn list(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
@@ -244,9 +343,11 @@ pub async fn list(
 /// A file.
 pub async fn file(
     State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
     Path(number): Path<String>,
 ) -> Result<Response, Error> {
     let record = known(&app, &number)?;
+    check_heard(&app, &caller, &record)?;
     let path = path_of(&app, record.id);
     let opened = privileged(move || {
         let file = File::open(path)?;
@@ -258,6 +359,12 @@ pub async fn file(
         .await
         .map_err(|_| Error::UnknownRecording(number.clone()))?;
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
+    // It breaks off when what was shown is not good any more.
+    let ended = {
+        let (app, service) = (Arc::clone(&app), record.service.clone());
+        async move { app.principals.ended(&caller.who, &service, false).await }
+    };
+    let stream = stream.take_until(Box::pin(ended));
     let mut response = Response::new(Body::from_stream(stream));
     let headers = response.headers_mut();
     let kind = HeaderValue::from_static("application/octet-stream");
@@ -288,6 +395,131 @@ pub async fn take(
     Path(id): Path<String>,
 ) -> Answer<Recording> {
     let handle = app.choreographer.servant(&id)?;
+    app.observers.may_take(&id)?;
     let why = format!("{} asked for it", caller.who.principal.name);
-    write(&app, &handle, &why).await.map(Json)
+    let taken = {
+        let app = Arc::clone(&app);
+        async move { write(&app, &handle, &why).await }
+    };
+    match to_its_end(&app.sessions, taken).await {
+        Some(taken) => taken.map(Json),
+        None => Err(Error::Internal("writing a recording")),
+    }
+}
+
+/// What comes of it, also where whoever waits for that has left. None: it broke.
+pub async fn to_its_end<T: Send + 'static>(
+    tasks: &TaskTracker,
+    work: impl Future<Output = T> + Send + 'static,
+) -> Option<T> {
+    tasks.spawn(work).await.ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use access::Grant;
+    use futures_util::FutureExt;
+    use tokio::sync::Notify;
+
+    use super::*;
+
+    fn record(id: u64, service: &str, bytes: u64) -> RecordingRecord {
+        RecordingRecord {
+            id,
+            service: service.to_owned(),
+            robot: "rover".to_owned(),
+            servant: format!("{service}-1"),
+            time: id,
+            why: "a test".to_owned(),
+            span: 1,
+            messages: 1,
+            bytes,
+            topics: None,
+        }
+    }
+
+    fn options(files: usize, disk: u64) -> BlackBoxOptions {
+        BlackBoxOptions {
+            span: Duration::from_secs(1),
+            memory: 1,
+            topics: Vec::new(),
+            files,
+            disk,
+        }
+    }
+
+    #[test]
+    fn the_service_that_takes_most_loses_its_oldest() {
+        let gone = |all: &[(u64, &str, u64)], new: (&str, u64), (files, disk)| {
+            let all: Vec<_> = all
+                .iter()
+                .map(|(id, service, bytes)| record(*id, service, *bytes))
+                .collect();
+            in_the_way(&all, &record(0, new.0, new.1), &options(files, disk))
+        };
+        let all = [
+            (5, "busy", 10),
+            (4, "busy", 10),
+            (3, "busy", 10),
+            (2, "quiet", 25),
+            (1, "quiet", 1),
+        ];
+        // There is room.
+        assert_eq!(gone(&all, ("busy", 4), (6, 60)), [] as [u64; 0]);
+        // By number: the busy one has most, whoever comes.
+        assert_eq!(gone(&all, ("busy", 1), (5, 60)), [3]);
+        assert_eq!(gone(&all, ("new", 1), (5, 60)), [3]);
+        assert_eq!(gone(&all, ("quiet", 1), (5, 60)), [1]);
+        // By bytes.
+        assert_eq!(gone(&all, ("busy", 10), (9, 60)), [3]);
+        assert_eq!(gone(&all, ("new", 15), (9, 60)), [3, 1]);
+        // One that needs so much alone.
+        assert_eq!(gone(&all, ("busy", 40), (9, 60)), [3, 4, 5, 1, 2]);
+        // However often the busy one comes, the quiet one's stay.
+        let mut known = vec![record(1, "quiet", 10)];
+        for id in 2..50 {
+            let new = record(id, "busy", 10);
+            let gone = in_the_way(&known, &new, &options(3, 1000));
+            known.retain(|one| !gone.contains(&one.id));
+            known.insert(0, new);
+        }
+        let left: Vec<_> = known.iter().map(|one| one.id).collect();
+        assert_eq!(left, [49, 48, 1]);
+    }
+
+    #[test]
+    fn a_file_is_had_by_who_may_hear_all_that_is_in_it() {
+        let grants = |all: &[&str]| {
+            let all = all.iter().map(|grant| grant.parse::<Grant>());
+            Grants::new(all.map(|grant| grant.expect("a grant")))
+        };
+        let topics = |all: &[&str]| all.iter().map(|topic| (*topic).to_owned()).collect();
+        let map: Vec<String> = topics(&["/map"]);
+        let both: Vec<String> = topics(&["/map", "/camera/image"]);
+        let narrow = grants(&["subscribe:/map", "publish:/camera/**"]);
+        assert!(may_hear(&narrow, &map));
+        assert!(!may_hear(&narrow, &both));
+        assert!(may_hear(&grants(&["subscribe:/**"]), &both));
+        assert!(!may_hear(&grants(&["call:/**"]), &map));
+    }
+
+    #[tokio::test]
+    async fn what_was_begun_is_done_when_nobody_waits_any_more() {
+        let tasks = TaskTracker::new();
+        let (go, done) = (Arc::new(Notify::new()), Arc::new(Notify::new()));
+        let work = {
+            let (go, done) = (Arc::clone(&go), Arc::clone(&done));
+            async move {
+                go.notified().await;
+                done.notify_one();
+            }
+        };
+        let mut waiting = Box::pin(to_its_end(&tasks, work));
+        assert!((&mut waiting).now_or_never().is_none());
+        drop(waiting);
+        go.notify_one();
+        done.notified().await;
+    }
 }

@@ -7,6 +7,7 @@ mod matrix;
 use ::access::Action;
 use api::access;
 use axum::extract::{DefaultBodyLimit, OriginalUri};
+use axum::http::Method;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, any, delete, get, patch, post, put};
 
@@ -510,8 +511,9 @@ pub const ROUTES: &[Route] = &[
             .answers::<api::people::Session>()
     }),
     at("DELETE", "/api/v1/session", ENTER, || delete(people::sign_out)).described(|| {
-        operation("signOut", "Ends the session that is shown, or all of that person; answers 204.")
+        operation("signOut", "Ends the session that is shown, or all of that person.")
             .asks::<people::Ending>()
+            .answers_nothing()
     }),
     at("GET", "/api/v1/oidc/login", Read, || get(people::provider::login)).described(|| {
         operation("oidcLogin", "Sends a browser to the identity provider, where somebody signs in.")
@@ -642,6 +644,18 @@ pub async fn nothing(uri: OriginalUri) -> Response {
         return oci::nothing(uri).await;
     }
     Error::UnknownPath {
+        path: uri.path().to_owned(),
+    }
+    .into_response()
+}
+
+/// Answers methods that no row has of a path that is in one: 405. Which it has is added by the router.
+pub async fn other_method(method: Method, OriginalUri(uri): OriginalUri) -> Response {
+    if uri.path().starts_with("/v2/") {
+        return oci::other_method(&method, &uri);
+    }
+    Error::OtherMethod {
+        method: method.to_string(),
         path: uri.path().to_owned(),
     }
     .into_response()

@@ -199,6 +199,18 @@ pub trait Reach: Send + Sync + 'static {
         let metrics = self.metrics();
         metrics.dropped.get() + metrics.bus_dropped.get()
     }
+    /// Dropped messages by topic, the most first: of rosbridge clients, and of links at both of their ends.
+    fn drops(&self) -> Vec<(String, u64)> {
+        let mut topics = self.metrics().drops.all();
+        for link in self.links() {
+            for drop in link.drops.iter().chain(&link.dropped) {
+                *topics.entry(drop.topic.clone()).or_default() += drop.count;
+            }
+        }
+        let mut topics: Vec<(String, u64)> = topics.into_iter().collect();
+        topics.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
+        topics
+    }
     /// Gives it material, and tells what it answers and when.
     async fn replay(
         &self,
@@ -247,7 +259,6 @@ pub struct Look {
 
 /// Why a servant is not reached, or not tried.
 #[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
 pub enum Error {
     /// Its ROS does not answer.
     #[error(transparent)]

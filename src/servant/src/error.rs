@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 /// Every error of this crate.
 #[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
 pub enum Error {
     /// A file or directory could not be used.
     #[error("could not {action} {path}: {source}")]

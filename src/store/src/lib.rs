@@ -51,7 +51,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 13] = [
+const MIGRATIONS: [&str; 14] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -65,6 +65,7 @@ const MIGRATIONS: [&str; 13] = [
     include_str!("011-provided.sql"),
     include_str!("012-history.sql"),
     include_str!("013-recordings.sql"),
+    include_str!("014-recorded-topics.sql"),
 ];
 
 /// What can go wrong.

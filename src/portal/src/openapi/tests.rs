@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::{BASE, document};
+use super::{ANY, BASE, MORE, REFUSED, document};
 use crate::routes::{Access, ROUTES};
 
 mod samples;
@@ -74,6 +74,33 @@ fn the_document_lists_exactly_the_routes_of_the_table() {
         .map(|row| format!("{} {}", row.method, row.path))
         .collect();
     assert_eq!(listed, table);
+}
+
+#[test]
+fn every_operation_says_with_what_it_may_be_refused() {
+    let document = written();
+    let mut ids = BTreeSet::new();
+    for (path, item) in document["paths"].as_object().expect("paths") {
+        for (method, operation) in item.as_object().expect("operations") {
+            ids.insert(operation["operationId"].as_str().expect("an id").to_owned());
+            let statuses = operation["responses"].as_object().expect("responses");
+            let is_refused = |status: &u16| statuses.contains_key(&status.to_string());
+            assert!(ANY.iter().all(is_refused), "{method} {path}");
+            let is_done = |status: &String| ["1", "2", "3"].iter().any(|s| status.starts_with(s));
+            assert!(
+                statuses.keys().any(is_done),
+                "{method} {path}: {statuses:?}"
+            );
+            assert!(!statuses.contains_key("default"), "{method} {path}");
+        }
+    }
+    let words: BTreeSet<u16> = REFUSED.iter().map(|(status, _)| *status).collect();
+    for (id, statuses) in MORE {
+        assert!(ids.contains(*id), "there is no {id}");
+        for status in *statuses {
+            assert!(words.contains(status), "nothing says what {status} is");
+        }
+    }
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -20,6 +21,8 @@ use ros::codec::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 256;
+/// So many times the warm-up a node that has registered is waited for where nobody is connected.
+const ALONE: u32 = 10;
 /// What waits until the topic is advertised and the node connected.
 const WAITING: Bounds = Bounds {
     messages: 256,
@@ -127,9 +130,15 @@ impl Inputs {
             nodes.filter(|node| *node != bridge::INSIDE).count()
         });
         let mut matched = publisher.matched();
-        let connected = matched
-            .wait_for(|matched| matched.connected_beside(bridge::INSIDE) >= listeners.max(1));
-        let _ = tokio::time::timeout(hub.options.warm_up, connected).await;
+        let mut connected = async |count: usize, patience: Duration| {
+            let reached = matched.wait_for(|now| now.connected_beside(bridge::INSIDE) >= count);
+            tokio::time::timeout(patience, reached).await.is_ok()
+        };
+        let warm_up = hub.options.warm_up;
+        if !connected(listeners.max(1), warm_up).await && listeners > 0 {
+            // A registered node is slow to connect on a busy machine: as long as nobody is connected, nobody else waits for it.
+            connected(1, warm_up * ALONE).await;
+        }
         let mut channels = self.channels.lock();
         if let Some(channel) = channels.get_mut(&input.channel) {
             if let State::Waiting(waiting) = &mut channel.state {

@@ -27,6 +27,7 @@ fn served(link: Link) -> Served {
             response: None,
             pids: Vec::new(),
             dropped: 0,
+            drops: Vec::new(),
             down: Vec::new(),
             hung: Vec::new(),
         },

@@ -88,7 +88,11 @@ fn servant() -> Servant {
             p95_ms: 1.5,
         }),
         pids: vec![1],
-        dropped: 0,
+        dropped: 1,
+        drops: vec![api::TopicDrops {
+            topic: "/x".into(),
+            count: 1,
+        }],
         hung: vec!["/x answered none of 3 inputs in 1.0 s".into()],
         down: vec![NodeDown {
             node: "/x".into(),

@@ -1,0 +1,294 @@
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use api::Size;
+use choreographer::Amount;
+use choreographer::Error as C;
+use servant::Error as E;
+
+use super::super::Error;
+use super::*;
+use crate::principals::{Uncertified, Uncoded};
+
+fn x() -> String {
+    "x".to_owned()
+}
+
+fn io() -> io::Error {
+    io::ErrorKind::Other.into()
+}
+
+fn not_json() -> serde_json::Error {
+    serde_json::from_str::<u8>("").expect_err("nothing")
+}
+
+/// One of each kind.
+fn own() -> Vec<Error> {
+    let (name, exists) = (x(), Vec::new());
+    let limit = Size(1);
+    vec![
+        Error::UnknownRobot {
+            name: x(),
+            exists: Vec::new(),
+        },
+        Error::UnknownRow {
+            service: x(),
+            id: x(),
+            exists: Vec::new(),
+        },
+        Error::UnknownPath { path: x() },
+        Error::OtherMethod {
+            method: x(),
+            path: x(),
+        },
+        Error::BadRequest(x()),
+        Error::WebSocketVersion,
+        Error::Unauthorised("x"),
+        Unrecognised::Revoked.into(),
+        Unrecognised::Expired.into(),
+        Unrecognised::Unknown.into(),
+        Unrecognised::Slowed(1).into(),
+        Unrecognised::SlowedSignIn(1).into(),
+        Unrecognised::SessionOver.into(),
+        Uncertified::Nameless(x()).into(),
+        Uncoded::Unknown.into(),
+        Error::Uncertifiable(authority::Error::Kind),
+        Error::Uncertifiable(authority::Error::Nameless(x())),
+        Error::UnknownPairing {
+            name: x(),
+            exists: Vec::new(),
+        },
+        Error::PlainText { instead: x() },
+        Error::Foreign {
+            what: x(),
+            next: x(),
+        },
+        Error::Forbidden { what: x() },
+        Error::UnknownToken {
+            name: x(),
+            exists: Vec::new(),
+        },
+        Error::TokenExists(x()),
+        Error::UnknownAccount { name, exists },
+        Error::AccountExists(x()),
+        Error::WrongPassword,
+        Error::NoProvider,
+        oidc::Error::Busy.into(),
+        Error::NoRole { who: x(), has: x() },
+        Error::SignInBusy,
+        Error::TooManyStreams { most: 1 },
+        Error::TooManyLook {
+            servant: x(),
+            most: 1,
+            each: 1,
+        },
+        Error::NotThereYet(x()),
+        Error::NoBlackBox(x()),
+        Error::UnknownRecording(x()),
+        Error::NotRecorded {
+            servant: x(),
+            reason: x(),
+        },
+        Error::RecordedLately {
+            servant: x(),
+            again: 1,
+        },
+        Error::UnknownRule {
+            id: x(),
+            exists: Vec::new(),
+        },
+        Error::RobotTaken(x()),
+        Error::BodyTooLarge { limit },
+        Error::TrialTooLarge { limit },
+        Error::Memory(budget::Exceeded {
+            name: x(),
+            asked: 2,
+            used: 0,
+            limit: 1,
+        }),
+        Error::Unfinished {
+            after: Duration::from_secs(1),
+        },
+        Error::Internal("x"),
+    ]
+}
+
+fn of_pushes() -> Vec<Error> {
+    use push::Error as P;
+    let pushes = [
+        P::NameTaken {
+            name: x(),
+            package: x(),
+            newcomer: x(),
+        },
+        P::NotAllowed(x()),
+        P::Options(x()),
+        P::Failed {
+            message: x(),
+            next: None,
+            log: Vec::new(),
+        },
+        P::TooLarge { limit: Size(1) },
+        P::Ending,
+        P::Engine(E::Exists { id: x() }),
+        P::Internal("x"),
+    ];
+    pushes.into_iter().map(Error::from).collect()
+}
+
+fn of_servants() -> Vec<Error> {
+    let amount = Amount::new(1.0, 1);
+    let refused = [
+        Refused::TooBig {
+            wanted: amount,
+            capacity: amount,
+        },
+        Refused::NoMore {
+            wanted: amount,
+            free: amount,
+        },
+        Refused::QueueFull { waiting: 1 },
+        Refused::Deadline {
+            waited: Duration::ZERO,
+            place: None,
+        },
+        Refused::Stalled {
+            why: x(),
+            waited: Duration::ZERO,
+            place: None,
+        },
+        Refused::NoMoreNow { why: x() },
+    ];
+    let unchanged = |reason| C::NotResized {
+        servant: x(),
+        service: x(),
+        stated: x(),
+        reason: Box::new(reason),
+    };
+    let kept = refused
+        .clone()
+        .map(|refused| unchanged(Unchanged::Full(refused)));
+    let others = [
+        unchanged(Unchanged::Many),
+        unchanged(Unchanged::Used {
+            used: Size(2),
+            wanted: Size(1),
+        }),
+        C::Terms(Untenable::UnknownClass {
+            name: x(),
+            exists: Vec::new(),
+        }),
+        C::UnknownServant {
+            id: x(),
+            exists: Vec::new(),
+        },
+        C::Place {
+            id: x(),
+            service: x(),
+            robot: x(),
+        },
+        C::Servant {
+            service: x(),
+            robot: x(),
+            reason: x(),
+            log: Vec::new(),
+        },
+        C::BackOff {
+            service: x(),
+            robot: x(),
+            failures: 1,
+            reason: x(),
+            again: Duration::ZERO,
+        },
+        C::NoRollout(x()),
+        C::Rollout(x()),
+        C::Ending,
+        C::Calibration(x()),
+        C::Shadow(x()),
+        C::Reach(reach::Error::Elsewhere(x())),
+        C::Reach(reach::Error::Linked(x())),
+        C::Reach(reach::Error::Trial(x())),
+        C::Internal("x"),
+        C::Engine(E::Call {
+            call: "x",
+            source: io(),
+        }),
+        C::Engine(E::Refused {
+            id: x(),
+            reason: x(),
+        }),
+        C::Engine(E::NoUidRange { base: 1, ranges: 1 }),
+        C::Engine(E::Image {
+            image: x(),
+            source: x().into(),
+        }),
+    ];
+    let full = refused.map(C::from);
+    let all = full.into_iter().chain(kept).chain(others);
+    all.map(Error::from).collect()
+}
+
+fn of_what_is_kept() -> Vec<Error> {
+    use catalogue::Error as K;
+    let path = PathBuf::from("x");
+    let state = store::Error::Record {
+        what: x(),
+        source: not_json(),
+    };
+    let full = image::Error::DiskFull {
+        path: path.clone(),
+        needed: None,
+        free: None,
+    };
+    let damaged = image::Error::Json {
+        path,
+        source: not_json(),
+    };
+    let kept = [
+        K::UnknownService {
+            name: x(),
+            exists: vec![x()],
+        },
+        K::UnknownRevision {
+            service: x(),
+            revision: x(),
+            exists: Vec::new(),
+        },
+        K::UnknownImage { what: x() },
+        K::NoStub {
+            service: x(),
+            reason: x(),
+        },
+        K::UnknownArchitecture {
+            asked: x(),
+            exists: Vec::new(),
+        },
+        K::Name(NameError::Service(x())),
+        K::Name(NameError::Reserved(x())),
+        K::Name(NameError::Robot(x())),
+        K::State(state),
+        K::Image(full),
+        K::Image(image::Error::BadTag { name: x() }),
+        K::Internal("x"),
+    ];
+    let kept = kept.into_iter().map(Error::from);
+    kept.chain([damaged.into()]).collect()
+}
+
+/// Whether a sentence says what to do, as the others do.
+fn is_a_step(next: &str) -> bool {
+    let begins_small = next.starts_with(|c: char| c.is_ascii_lowercase());
+    begins_small && !next.ends_with('.') && !next.contains('\n') && next.len() < 300
+}
+
+#[test]
+fn every_refusal_says_what_to_do() {
+    let all = [own(), of_pushes(), of_servants(), of_what_is_kept()];
+    for error in all.into_iter().flatten() {
+        let problem = error.problem();
+        let next = problem.next.as_deref().unwrap_or_default();
+        assert!(is_a_step(next), "{error:?}: {next:?}");
+        assert!(!problem.detail.is_empty(), "{error:?}");
+    }
+}
