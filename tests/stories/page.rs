@@ -4,11 +4,12 @@
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::daemon::Daemon;
+use support::deployer::path_str;
+use support::machine::Machine;
 use support::world::{ADDER, PEOPLE, TELLER, world};
 use support::{Verdict, binaries};
 
@@ -18,6 +19,42 @@ use crate::people::account;
 
 const PASSWORD: &str = "four quiet purple engines";
 
+/// A robot that has `adder_py` add with roslibpy, by itself.
+struct Adder(Child);
+
+impl Adder {
+    /// Returns once it has a sum.
+    fn begins(url: &str) -> anyhow::Result<Adder> {
+        let child = Command::new(binaries::python())
+            .arg(binaries::checkout().join("tests/robots/adds_with_roslibpy.py"))
+            .arg(url)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let mut adder = Adder(child);
+        let mut line = String::new();
+        let out = adder.0.stdout.as_mut().context("piped")?;
+        BufReader::new(out).read_line(&mut line)?;
+        ensure!(line == "added\n", "roslibpy said {line:?}");
+        Ok(adder)
+    }
+
+    /// Ends it, which found every sum right.
+    fn ends(mut self) -> Verdict {
+        drop(self.0.stdin.take());
+        let status = self.0.wait()?;
+        ensure!(status.success(), "roslibpy ended with {status}");
+        Ok(())
+    }
+}
+
+impl Drop for Adder {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// Begins a step of `page.cjs`, in which somebody shows this token.
 fn begins(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child> {
     begins_at(daemon, &format!("http://{}/", daemon.address), step, token)
@@ -25,9 +62,15 @@ fn begins(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child> {
 
 /// The same at another address of the daemon.
 fn begins_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Result<Child> {
+    goes(daemon, url, step, token)
+        .spawn()
+        .context("node, which make deps installs")
+}
+
+fn goes(daemon: &Daemon, url: &str, step: &str, token: &str) -> Command {
     let checkout = binaries::checkout();
-    Command::new("node")
-        .arg(checkout.join("tests/web/page.cjs"))
+    let mut node = Command::new("node");
+    node.arg(checkout.join("tests/web/page.cjs"))
         .args([step, url])
         .arg(checkout.join("target/web"))
         .arg(token)
@@ -37,9 +80,8 @@ fn begins_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Res
         .env("TMPDIR", &daemon.home)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .context("node, which make deps installs")
+        .stderr(Stdio::piped());
+    node
 }
 
 fn ends(mut child: Child, step: &str) -> Verdict {
@@ -59,7 +101,9 @@ fn does(daemon: &Daemon, step: &str, token: &str) -> Verdict {
 }
 
 pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
-    let daemon = daemon("page")?;
+    // The robot's servant is there until somebody stops it.
+    let config = "[servant]\ngrace = \"10m\"\n";
+    let daemon = world().own("page").config(config).start()?;
     let made = account(&daemon, &["create", "ada", "--role", "operator"], PASSWORD)?;
     made.succeeded()?;
     let admin = token(&daemon, &["admin", "--role", "admin"])?;
@@ -69,29 +113,12 @@ pub fn it_shows_what_happens_and_does_what_one_may() -> Verdict {
     let other = ["stranger", "--role", "viewer", "--service", "other*"];
     let stranger = token(&daemon, &other)?;
     let path = format!("adder_py?robot=rover&rrt=50ms&max_rrt=200ms&token={admin}");
-    let mut robot = daemon.robot(&path)?;
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        // The robot works meanwhile, and its servant warns of each sum.
-        let works = scope.spawn(|| -> Verdict {
-            for sum in 0.. {
-                if done.load(Ordering::Relaxed) {
-                    break;
-                }
-                robot.calls("/add_two", json!({"a": -40 - sum % 5, "b": 0}))?;
-                std::thread::sleep(Duration::from_millis(50));
-            }
-            Ok(())
-        });
-        let told = does(&daemon, "operator", &admin)
-            .and_then(|()| does(&daemon, "viewer", &viewer))
-            .and_then(|()| does(&daemon, "stranger", &stranger));
-        done.store(true, Ordering::Relaxed);
-        let worked = works
-            .join()
-            .unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
-        told.and(worked)
-    })?;
+    // It works meanwhile, and its servant warns of each sum.
+    let robot = Adder::begins(&daemon.url(&path))?;
+    does(&daemon, "operator", &admin)?;
+    does(&daemon, "viewer", &viewer)?;
+    does(&daemon, "stranger", &stranger)?;
+    robot.ends()?;
     does(&daemon, "remover", &admin)?;
     does(&daemon, "admin", &admin)
 }
@@ -109,6 +136,8 @@ pub fn a_canary_is_begun_promoted_and_taken_back() -> Verdict {
         (service["revision"] == 2).then_some(())
     })?;
     pushes(&["--canary", "1"])?;
+    let viewer = token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
+    does(&daemon, "bystander", &viewer)?;
     does(&daemon, "aborter", &admin)?;
     let service = daemon.deployer().asks(&["services", "adder_py"])?;
     ensure!(service["revision"] == 2, "{service:#}");
@@ -138,6 +167,19 @@ pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
         .deployer()
         .pushes("teller_py", TELLER.arguments)?
         .succeeded()?;
+    // Of some size, so that it is seen how much of it was sent.
+    let machine = Machine::new()?;
+    let recorded = r#"
+import rosbag
+from std_msgs.msg import Float64MultiArray, String
+with rosbag.Bag("/root/talk.bag", "w") as bag:
+    for number in range(12):
+        bag.write("/chatter", String("word %d" % number))
+        bag.write("/noise", Float64MultiArray(data=[0.5] * 3000))
+"#;
+    machine
+        .runs("sh", &format!("python3 - << 'END'\n{recorded}END"))?
+        .succeeded()?;
     let path = format!("teller_py?robot=talker&token={admin}");
     let mut robot = daemon.robot(&path)?;
     robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
@@ -163,7 +205,12 @@ pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
             }
             Ok(())
         });
-        let told = does(&daemon, "calibrator", &admin);
+        let url = format!("http://{}/", daemon.address);
+        let told = goes(&daemon, &url, "calibrator", &admin)
+            .env("RECORDING", path_str(&machine.written("/root/talk.bag")))
+            .spawn()
+            .map_err(anyhow::Error::from)
+            .and_then(|child| ends(child, "calibrator"));
         over.store(true, Ordering::Relaxed);
         let talked = talks
             .join()
@@ -175,7 +222,8 @@ pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
 pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
     let daemon = world()
         .own("page-inside")
-        .config("[black_box]\nseconds = \"10s\"\n")
+        // Pictures alone are some hundred megabytes a second.
+        .config("[black_box]\nseconds = \"10s\"\ntopics = [\"/sights/scan\", \"/sights/say\", \"/tf*\"]\n")
         .start()?;
     let admin = token(&daemon, &["admin", "--role", "admin"])?;
     let viewer = token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
@@ -197,6 +245,7 @@ pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
     robot.calls("/rosapi/get_time", json!({}))?;
     does(&daemon, "looker", &admin)?;
     does(&daemon, "onlooker", &viewer)?;
+    does(&daemon, "clearer", &admin)?;
     ensure!(daemon.servants_of("sights_py")?.len() == 1);
     robot.leaves()
 }

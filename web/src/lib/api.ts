@@ -11,10 +11,27 @@ export class Problem extends Error {
     detail: string,
     /** What to do. */
     readonly next: string,
+    /** Where a name was not found: those that exist. */
+    readonly exists: string[] = [],
+    /** Lines of a log that explain it. */
+    readonly log: string[] = [],
   ) {
     super(detail);
   }
+
+  /** As the daemon tells it. */
+  static of({ status = 0, title = '', detail, next = '', exists, log }: Told, otherwise = ''): Problem {
+    return new Problem(status, title, detail || title || otherwise, next, exists, log);
+  }
+
+  /** Of what the page itself found wrong. */
+  static here(detail: string, next: string): Problem {
+    return new Problem(0, '', detail, next);
+  }
 }
+
+/** A refusal as JSON. */
+export interface Told { status?: number; title?: string; detail?: string; next?: string; exists?: string[]; log?: string[] }
 
 let csrf = '';
 
@@ -22,6 +39,8 @@ export const token = {
   get: () => sessionStorage.getItem(TOKEN) ?? '',
   set: (value: string) => (value ? sessionStorage.setItem(TOKEN, value) : sessionStorage.removeItem(TOKEN)),
 };
+
+const noAnswer = () => new Problem(0, 'no answer', 'the daemon does not answer', 'look whether cloudroidd runs and can be reached; this page goes on by itself when it does');
 
 /** Asks, and gives the answer if it is none of refusal. */
 export async function fetched(path: string, options: RequestInit = {}, base = '/api/v1'): Promise<Response> {
@@ -33,11 +52,11 @@ export async function fetched(path: string, options: RequestInit = {}, base = '/
     answer = await fetch(`${base}${path}`, { ...options, headers, cache: 'no-store' });
   } catch (error) {
     if (options.signal?.aborted) throw error;
-    throw new Problem(0, 'no answer', 'the daemon does not answer', 'look whether cloudroidd runs and can be reached; this page goes on by itself when it does');
+    throw noAnswer();
   }
   if (answer.ok) return answer;
   const said = await answer.json().catch(() => ({}));
-  throw new Problem(answer.status, said.title ?? answer.statusText, said.detail ?? answer.statusText, said.next ?? '');
+  throw Problem.of({ title: answer.statusText, ...said, status: answer.status }, `the daemon answered with ${answer.status}`);
 }
 
 export async function asked<T>(path: string, options?: RequestInit): Promise<T> {
@@ -84,4 +103,62 @@ export async function* lines(answer: Response): AsyncGenerator<string> {
     yield* parts;
   }
   if (rest) yield rest;
+}
+
+/** How often lines of an answer are looked for: each look copies what has come so far. */
+const LOOKS = 200;
+
+/** Sends a body and gives lines of the answer as they come; `gone` is told how much of the body was sent, which `fetch` tells nobody. */
+export async function* exchanged(path: string, body: Blob | undefined, signal: AbortSignal, gone: (done: number, total: number) => void): AsyncGenerator<string> {
+  const request = new XMLHttpRequest();
+  request.open('POST', `/api/v1${path}`);
+  if (token.get()) request.setRequestHeader('Authorization', `Bearer ${token.get()}`);
+  else if (csrf) request.setRequestHeader('X-CSRF-Token', csrf);
+  let wake = () => {};
+  let over = false;
+  let failed: Problem | undefined;
+  request.upload.onprogress = ({ loaded, total }) => gone(loaded, total);
+  request.onprogress = () => wake();
+  request.onerror = () => { failed = noAnswer(); };
+  request.onloadend = () => {
+    over = true;
+    wake();
+  };
+  const stop = () => request.abort();
+  signal.addEventListener('abort', stop);
+  try {
+    signal.throwIfAborted();
+    request.send(body);
+    let at = 0;
+    for (;;) {
+      const ended = over;
+      signal.throwIfAborted();
+      if (failed) throw failed;
+      const refused = request.readyState >= 2 && (request.status < 200 || request.status > 299);
+      if (refused && ended) throw Problem.of({ title: request.statusText, ...told(request.responseText), status: request.status }, `the daemon answered with ${request.status}`);
+      const text = refused ? '' : request.responseText;
+      for (let end = text.indexOf('\n', at); end >= 0; end = text.indexOf('\n', at)) {
+        yield text.slice(at, end);
+        at = end + 1;
+      }
+      if (ended) {
+        if (at < text.length) yield text.slice(at);
+        return;
+      }
+      if (over) continue;
+      await new Promise<void>((resolve) => { wake = resolve; });
+      if (!over) await new Promise((resolve) => setTimeout(resolve, LOOKS));
+    }
+  } finally {
+    signal.removeEventListener('abort', stop);
+    if (!over) request.abort();
+  }
+}
+
+function told(text: string): Told {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return {};
+  }
 }

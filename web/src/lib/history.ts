@@ -88,14 +88,21 @@ function recorded<K extends string>(names: readonly K[], of: 'hour' | 'day', tim
   return series;
 }
 
-export async function servantPast(id: string, of: 'hour' | 'day'): Promise<{ series: ServantSeries; local: LocalPeriod[] }> {
+/** What a servant did, which may have ended, and when its robot was served by the local original; `found` is none where nothing is recorded of it. */
+export async function servantPast(id: string, of: 'hour' | 'day'): Promise<{ found?: ServantHistory; series: ServantSeries; local: LocalPeriod[] }> {
   const [found] = await asked<ServantHistory[]>(`/history/servants?servant=${encodeURIComponent(id)}&step=${STEPS[of]}`);
   const figures = found?.figures;
   const series = recorded(SERVANT, of, figures?.time ?? [], (name) => {
     const list = figures?.[name] ?? [];
     return name === 'throttled' ? list.map((share) => share && share * 100) : list;
   });
-  return { series, local: found?.local ?? [] };
+  return { ...(found && { found }), series, local: found?.local ?? [] };
+}
+
+/** Servants that were there in the last day, the newest first; `now` is the daemon's clock. No figure is of a time that long ago: none is sent. */
+export function servantsPast(now: number): Promise<ServantHistory[]> {
+  const from = Math.round(now) - SECONDS.day * 1000;
+  return asked<ServantHistory[]>(`/history/servants?from=${from}&to=${from}`);
 }
 
 export async function machinePast(of: 'hour' | 'day'): Promise<MachineSeries> {
@@ -114,6 +121,30 @@ export function goesOn<K extends string>(past: Series<K>, of: 'hour' | 'day', no
 export const machine: MachineSeries = new Series(MACHINE);
 export const servants = new Map<string, ServantSeries>();
 
+const TOPICS = ['first', 'second', 'third', 'fourth', 'fifth'] as const;
+
+/** Messages dropped by topic, of the first five topics of a servant that lost some. */
+export interface TopicDrops {
+  /** Of each series in its order. */
+  topics: string[];
+  series: Series<(typeof TOPICS)[number]>;
+}
+export const dropsByTopic = new Map<string, TopicDrops>();
+/** The name of a topic's series. */
+export const dropKey = (place: number) => TOPICS[place]!;
+
+function rememberDrops(time: number, id: string, served: Served): void {
+  const now = served.servant.drops ?? [];
+  let known = dropsByTopic.get(id);
+  if (!known && !now.length) return;
+  if (!known) dropsByTopic.set(id, (known = { topics: [], series: new Series(TOPICS) }));
+  for (const { topic } of now) {
+    if (known.topics.length < TOPICS.length && !known.topics.includes(topic)) known.topics.push(topic);
+  }
+  const counted = known.topics.map((topic, place) => [TOPICS[place], now.find((one) => one.topic === topic)?.count]);
+  known.series.add(time, Object.fromEntries(counted) as Record<(typeof TOPICS)[number], number | undefined>);
+}
+
 export function rememberMachine(time: number, now: Machine): void {
   machine.add(time, {
     cores: now.cores,
@@ -127,7 +158,9 @@ export function rememberMachine(time: number, now: Machine): void {
 
 export function rememberServants(time: number, now: Map<string, Served>): void {
   for (const id of servants.keys()) if (!now.has(id)) servants.delete(id);
+  for (const id of dropsByTopic.keys()) if (!now.has(id)) dropsByTopic.delete(id);
   for (const [id, served] of now) {
+    rememberDrops(time, id, served);
     let series = servants.get(id);
     if (!series) servants.set(id, (series = new Series(SERVANT)));
     const { usage, response, dropped } = served.servant;

@@ -1,5 +1,5 @@
 // A push that is under way: it goes on while other pages are looked at, and ends with this tab.
-import { fetched, lines, Problem } from './api';
+import { exchanged, Problem, type Told } from './api';
 import type { ServiceDetail } from './types';
 
 export interface Options {
@@ -31,9 +31,9 @@ type PushEvent =
   | { type: 'progress'; unit: string; done: number; total?: number }
   | { type: 'warning'; message: string }
   | { type: 'done'; service: ServiceDetail; took: number }
-  | { type: 'error'; problem: { status: number; title: string; detail: string; next?: string } };
+  | { type: 'error'; problem: Told };
 
-export interface Step { title: string; began: number; took?: number; failed?: boolean }
+export interface Step { title: string; began: number; took?: number; end?: 'done' | 'failed' | 'cancelled' }
 
 /** Lines of the build log that are kept. */
 const KEPT = 5000;
@@ -49,6 +49,7 @@ class Push {
   log = $state.raw<{ number: number; line: string }[]>([]);
   done = $state.raw<ServiceDetail>();
   problem = $state.raw<unknown>();
+  cancelled = $state(false);
 
   #stop: AbortController | undefined;
   #come: { number: number; line: string }[] = [];
@@ -69,27 +70,30 @@ class Push {
     this.#come = [];
     this.done = undefined;
     this.problem = undefined;
+    this.cancelled = false;
     this.#step('sending');
     const stop = new AbortController();
     this.#stop = stop;
     try {
       const query = encodeURIComponent(JSON.stringify(options));
-      if (query.length > LONGEST) throw new Problem(0, '', `the options are ${query.length} bytes long, which is too much`, 'shorten the interface or the parameters');
-      const answer = await fetched(`/push?options=${query}`, { method: 'POST', signal: stop.signal, ...(body ? { body } : {}) });
-      for await (const line of lines(answer)) if (line) this.#take(JSON.parse(line));
-      if (!this.done && !this.problem) throw new Problem(0, '', 'the daemon broke off', 'see its log, and whether it runs');
+      if (query.length > LONGEST) throw Problem.here(`the options are ${query.length} bytes long, which is too much`, 'shorten the interface or the parameters');
+      // The first word of the daemon ends the sending.
+      const gone = (done: number, total: number) => { if (this.steps.length === 1) this.progress = { unit: 'bytes', done, total }; };
+      for await (const line of exchanged(`/push?options=${query}`, body, stop.signal, gone)) if (line) this.#take(JSON.parse(line));
+      if (!this.done && !this.problem) throw Problem.here('the daemon broke off', 'see its log, and whether it runs');
     } catch (error) {
-      this.problem = stop.signal.aborted ? new Problem(0, '', 'cancelled; nothing was published', '') : error;
+      if (stop.signal.aborted) this.cancelled = true;
+      else this.problem = error;
     }
-    this.#end(this.problem !== undefined);
+    this.#end(this.cancelled ? 'cancelled' : this.problem === undefined ? 'done' : 'failed');
     this.busy = false;
   }
 
-  #end(failed = false): void {
+  #end(end: Step['end'] = 'done'): void {
     const last = this.steps.at(-1);
     if (last && last.took === undefined) {
       last.took = Date.now() - last.began;
-      last.failed = failed;
+      last.end = end;
     }
     this.progress = undefined;
   }
@@ -121,7 +125,7 @@ class Push {
         this.done = event.service;
         return;
       case 'error':
-        this.problem = new Problem(event.problem.status, event.problem.title, event.problem.detail, event.problem.next ?? '');
+        this.problem = Problem.of(event.problem);
     }
   }
 }

@@ -6,13 +6,16 @@ type Message = Record<string, unknown>;
 type Hears = (message: unknown) => void;
 
 /** How a goal ends (action_msgs/GoalStatus). */
-const ENDS: Record<number, string> = { 4: 'succeeded', 5: 'was cancelled', 6: 'was aborted' };
+export const CANCELLED = 'was cancelled';
+const ENDS: Record<number, string> = { 4: 'succeeded', 5: CANCELLED, 6: 'was aborted' };
 
 export interface Goal {
   /** Told of each feedback. */
   feedback: Hears;
   /** Told once, with how it ended in words. */
   result: (words: string, values: unknown, good: boolean) => void;
+  /** Told in place of that where it was not taken. */
+  refused: (why: Problem) => void;
 }
 
 export interface Hearing {
@@ -22,6 +25,13 @@ export interface Hearing {
   pause?: number;
   /** Messages that the daemon keeps for this page; the newest win. */
   keep?: number;
+}
+
+/** What to do about what was refused, or has failed, inside. */
+function refusal(words: string): Problem {
+  if (words.includes('not granted')) return Problem.here(words, 'to see a service is to listen there: ask its operator to do this, or for a rule that grants it (Access, Policy)');
+  if (/no definition|not known|does not exist|not advertised/.test(words)) return Problem.here(words, 'see what there is in the lists of this page; they are read when it is opened');
+  return Problem.here(words, 'correct what was sent, and see what the node says of it in the servant’s log');
 }
 
 export class Rosbridge {
@@ -34,8 +44,8 @@ export class Rosbridge {
   readonly ready: Promise<void>;
   /** Told when it is lost, in words. */
   lost: (problem: Problem) => void = () => {};
-  /** What the daemon says of it. */
-  status: (words: string) => void = () => {};
+  /** What the daemon says of it: a Problem where it refuses something. */
+  status: (said: string | Problem) => void = () => {};
 
   constructor(servant: string) {
     const address = `${location.origin.replace(/^http/, 'ws')}/api/v1/servants/${encodeURIComponent(servant)}/inside`;
@@ -45,7 +55,7 @@ export class Rosbridge {
     this.ready = new Promise((resolve, reject) => {
       this.#socket.onopen = () => resolve();
       this.#socket.onclose = (event) => {
-        const problem = new Problem(0, '', event.reason || 'the connection into the servant was refused or lost', 'who you are must be allowed to see its service, and few pages may look into one servant at once; load the page again to try once more');
+        const problem = Problem.here(event.reason || 'the connection into the servant was refused or lost', 'who you are must be allowed to see its service, and few pages may look into one servant at once; load the page again to try once more');
         for (const { reject } of this.#calls.values()) reject(problem);
         this.#calls.clear();
         reject(problem);
@@ -58,18 +68,19 @@ export class Rosbridge {
   #take(message: Message): void {
     const id = message.id as string;
     if (message.op === 'publish') for (const hears of this.#heard.get(message.topic as string) ?? []) hears(message.msg);
-    else if (message.op === 'status') this.status(String(message.msg));
+    else if (message.op === 'status') this.status(message.level === 'error' ? refusal(String(message.msg)) : String(message.msg));
     else if (message.op === 'action_feedback') this.#goals.get(id)?.feedback(message.values);
     else if (message.op === 'action_result') {
       const goal = this.#goals.get(id);
       this.#goals.delete(id);
       const good = message.result === true && message.status === 4;
-      goal?.result(ENDS[message.status as number] ?? 'did not come to an end', message.values, good);
+      if (message.result !== true && typeof message.values === 'string') goal?.refused(refusal(message.values));
+      else goal?.result(ENDS[message.status as number] ?? 'did not come to an end', message.values, good);
     } else if (message.op === 'service_response') {
       const call = this.#calls.get(id);
       this.#calls.delete(id);
       if (message.result) call?.resolve(message.values);
-      else call?.reject(new Problem(0, '', typeof message.values === 'string' ? message.values : JSON.stringify(message.values), ''));
+      else call?.reject(refusal(typeof message.values === 'string' ? message.values : JSON.stringify(message.values)));
     }
   }
 
@@ -118,20 +129,4 @@ export class Rosbridge {
     this.lost = () => {};
     this.#socket.close();
   }
-}
-
-export interface Definition { type: string; fieldnames: string[]; fieldtypes: string[]; fieldarraylen: number[]; examples: string[] }
-
-const PLAIN: Record<string, unknown> = { string: '', bool: false, time: { secs: 0, nsecs: 0 }, duration: { secs: 0, nsecs: 0 } };
-
-/** A message with nothing in it, of definitions as rosapi gives them: the first is its own. */
-export function blank(definitions: Definition[], type = definitions[0]?.type): unknown {
-  const own = definitions.find((one) => one.type === type);
-  if (!own) return PLAIN[type ?? ''] ?? 0;
-  return Object.fromEntries(own.fieldnames.map((name, index) => {
-    const length = own.fieldarraylen[index] ?? -1;
-    const of = own.fieldtypes[index] ?? '';
-    const one = () => (definitions.some((other) => other.type === of) ? blank(definitions, of) : PLAIN[of] ?? 0);
-    return [name, length === -1 ? one() : Array.from({ length: Math.max(length, 0) }, one)];
-  }));
 }

@@ -105,6 +105,7 @@ export interface Servant {
   response?: { requests: number; p50_ms: number; p95_ms: number };
   pids: number[];
   dropped: number;
+  drops?: { topic: string; count: number }[];
   down: { node: string; failures: number; again: number }[];
   hung: string[];
 }
