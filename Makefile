@@ -63,7 +63,7 @@ stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it 
 test-cross: stub-cross build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
-	@CLOUDROID_CROSS=1 cargo test $(DEV) --test stories -- cross::
+	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" cargo test $(DEV) --test stories -- cross::
 
 # The daemon is compiled with the page that stands in web/dist. Nothing is done where web/ has not changed.
 .PHONY: web
@@ -165,6 +165,17 @@ test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual
 .PHONY: bench
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
 	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
+
+# What the evaluation runs beside its own experiments.
+EVAL_BENCHES := failover choreographer servant portal
+
+.PHONY: eval
+eval: test-deps build ## the published experiments on this machine, with a report; QUICK=1: few requests; ONLY=2,7; FRESH=1: all anew (as root)
+	@scripts/deps build run test eval
+	@cargo build --locked --release -p eval
+	@[ -n "$(QUICK)" ] || cargo build --locked --release $(EVAL_BENCHES:%=-p bench-%)
+	@[ -n "$(QUICK)" ] || cargo build --locked --release -p bench-codecs --features video
+	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/release/eval" $(if $(QUICK),--quick) $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))
 
 .PHONY: fuzz
 fuzz: ## a minute of fuzzing for every decoder; ONLY=name for one, FUZZ_SECONDS=n for another time
