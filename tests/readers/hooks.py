@@ -162,5 +162,5 @@ def after_call(context, case, response):
     operation = id_of(case)
     with open(GIVEN["answers"], "a") as answers:
         answers.write(json.dumps({"operation": operation, "status": response.status_code}) + "\n")
-    if response.status_code == 200 and response.headers.get("content-type") == "application/json":
+    if response.status_code == 200 and "application/json" in response.headers.get("content-type", []):
         learn(operation, json.loads(response.content))

@@ -347,6 +347,7 @@ pub fn an_action_is_carried_out_in_the_cloud() -> Verdict {
 const LATE: Badness = Badness {
     rate: 100_000,
     delay: 15_000,
+    jitter: 0,
     loss: 0.0,
     limit: 10_000,
 };
@@ -551,6 +552,7 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
         cable.degrade(Badness {
             rate: 20_000,
             delay: 5,
+            jitter: 0,
             loss: 0.0,
             limit: 10_000,
         })?;

@@ -20,6 +20,7 @@ const T_MAX: f64 = 5.0;
 const SLOW: Badness = Badness {
     rate: 100_000,
     delay: 15_000,
+    jitter: 0,
     loss: 0.0,
     limit: 10_000,
 };

@@ -20,6 +20,7 @@ use support::world::{LOCALISER, world};
 const SILENT: Badness = Badness {
     rate: 100_000,
     delay: 1,
+    jitter: 0,
     loss: 1.0,
     limit: 1000,
 };

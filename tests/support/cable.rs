@@ -1,5 +1,5 @@
-//! A network between a robot and a server that can be made bad: a network namespace for the server's end, joined to
-//! this machine's own, where the robot is.
+//! A network between a robot and a server that can be made bad: a network namespace for one of them, joined to this
+//! machine's own, where the other is.
 //!
 //! ```text
 //!  robot ── its end ══ degraded, both ways ══ the server's end ── passed on ──▶ portal
@@ -29,6 +29,8 @@ pub struct Badness {
     pub rate: u32,
     /// How long a packet is on the way, milliseconds.
     pub delay: u32,
+    /// By how much that differs from packet to packet at most, milliseconds, evenly distributed; their order is kept.
+    pub jitter: u32,
     /// Share of packets that are lost.
     pub loss: f64,
     /// Packets that wait before others are dropped.
@@ -46,6 +48,7 @@ impl Badness {
             format!("{}kbit", self.rate),
             "delay".to_owned(),
             format!("{}ms", self.delay),
+            format!("{}ms", self.jitter),
             "loss".to_owned(),
             format!("{}%", self.loss * 100.0),
         ]
@@ -58,15 +61,27 @@ pub struct Cable {
     /// Where the robot reaches the portal.
     pub server: SocketAddr,
     name: String,
+    /// In this machine's own network, and in the namespace.
     ends: [String; 2],
+    /// The robot is in the namespace; else the server.
+    robot_inside: bool,
     /// None where the kernel has netem.
     shaper: Option<Shaper>,
     over: Arc<AtomicBool>,
 }
 
 impl Cable {
-    /// Joins both, and passes connections on to `portal`.
+    /// Joins both, the server in the namespace, and passes connections on to `portal`.
     pub fn new(portal: &str) -> anyhow::Result<Self> {
+        Self::between(portal, false)
+    }
+
+    /// The same with the robot in the namespace ([`Cable::namespace`]), where there is nothing else but a loopback.
+    pub fn with_robot_inside(portal: &str) -> anyhow::Result<Self> {
+        Self::between(portal, true)
+    }
+
+    fn between(portal: &str, robot_inside: bool) -> anyhow::Result<Self> {
         let id = std::process::id();
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = format!("cloudroid-cable-{id}-{number}");
@@ -87,6 +102,7 @@ impl Cable {
             server: ([0, 0, 0, 0], 0).into(),
             name,
             ends,
+            robot_inside,
             shaper: None,
             over: Arc::default(),
         };
@@ -97,7 +113,12 @@ impl Cable {
         let theirs_address = format!("{}/30", address(2));
         cable.there(&["addr", "add", &theirs_address, "dev", theirs])?;
         cable.there(&["link", "set", theirs, "up"])?;
-        let listener = cable.listen(&address(2))?;
+        let listener = if robot_inside {
+            cable.there(&["link", "set", "lo", "up"])?;
+            TcpListener::bind((address(1), 0))?
+        } else {
+            cable.listen(&address(2))?
+        };
         cable.server = listener.local_addr()?;
         let (portal, over) = (portal.to_owned(), cable.over.clone());
         std::thread::spawn(move || pass_on(&listener, &portal, &over));
@@ -135,7 +156,17 @@ impl Cable {
             let text = std::fs::read_to_string(&path).context(path)?;
             Ok(text.trim().parse()?)
         };
-        Ok((count("tx")?, count("rx")?))
+        let (out, back) = (count("tx")?, count("rx")?);
+        Ok(if self.robot_inside {
+            (back, out)
+        } else {
+            (out, back)
+        })
+    }
+
+    /// Of the end that is not this machine's own.
+    pub fn namespace(&self) -> PathBuf {
+        PathBuf::from("/run/netns").join(&self.name)
     }
 
     /// Makes it bad, both ways.
@@ -173,7 +204,7 @@ impl Cable {
 
     /// A socket of the server's end. A thread enters the namespace and ends there.
     fn listen(&self, address: &str) -> anyhow::Result<TcpListener> {
-        let path = PathBuf::from("/run/netns").join(&self.name);
+        let path = self.namespace();
         let place = std::fs::File::open(&path).with_context(|| path.display().to_string())?;
         let address = format!("{address}:0");
         let made = std::thread::spawn(move || -> anyhow::Result<TcpListener> {

@@ -78,18 +78,20 @@ impl Camera {
     pub fn new(site: &Site, queue: usize) -> anyhow::Result<Self> {
         let node = site.node("/camera")?;
         let found = site.hears(&node, "/people_detect/found")?;
-        let image = site.runtime.block_on(node.advertise(
-            "/image",
-            WireType::new(
-                "sensor_msgs/Image",
-                "060021388200f6f0f447d0fcd9c64743",
-                IMAGE,
-            ),
-            Qos::keep_last(queue),
-        ))?;
+        let image = node.advertise("/image", image_type(), Qos::keep_last(queue));
+        let image = site.runtime.block_on(image)?;
         site.connected(&*image, 1)?;
         Ok(Self { found, image, node })
     }
+}
+
+/// Of `sensor_msgs/Image`.
+pub fn image_type() -> WireType {
+    WireType::new(
+        "sensor_msgs/Image",
+        "060021388200f6f0f447d0fcd9c64743",
+        IMAGE,
+    )
 }
 
 /// A `sensor_msgs/Image` in bgr8, stamped with its number.

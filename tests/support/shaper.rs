@@ -1,5 +1,5 @@
 //! What netem does, for kernels without it: packets between two TUN devices are delayed, lost and slowed down. The
-//! order of packets is kept, as netem keeps it without jitter.
+//! order of packets is kept, as netem keeps it without jitter, and as a rate makes it keep it with jitter.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -87,7 +87,7 @@ impl State {
                 let takes = Duration::from_secs_f64(bits / (f64::from(badness.rate) * 1e3));
                 let left = self.free.unwrap_or(now).max(now) + takes;
                 self.free = Some(left);
-                left + Duration::from_millis(badness.delay.into())
+                left + self.on_the_way(&badness)
             }
             None => now,
         };
@@ -98,14 +98,29 @@ impl State {
         self.under_way.push_back((after, packet.to_vec()));
     }
 
-    /// Xorshift (Marsaglia, 2003).
+    /// The delay, more or less as much as the jitter.
+    fn on_the_way(&mut self, badness: &Badness) -> Duration {
+        let jitter = f64::from(badness.jitter);
+        let more = if badness.jitter == 0 {
+            0.0
+        } else {
+            jitter * (2.0 * self.random() - 1.0)
+        };
+        Duration::from_secs_f64((f64::from(badness.delay) + more).max(0.0) / 1e3)
+    }
+
     fn is_lost(&mut self, share: f64) -> bool {
+        self.random() < share
+    }
+
+    /// From 0 to 1; xorshift (Marsaglia, 2003).
+    fn random(&mut self) -> f64 {
         let mut random = self.random | 1;
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
         self.random = random;
-        ((random >> 11) as f64 / (1_u64 << 53) as f64) < share
+        (random >> 11) as f64 / (1_u64 << 53) as f64
     }
 }
 

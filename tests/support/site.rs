@@ -337,12 +337,8 @@ impl Site {
         argv: &[&str],
     ) -> anyhow::Result<Running> {
         let script = self.in_image(daemon, service)?;
-        let mut command = Command::new("unshare");
-        command
-            .args(["--mount", "sh", "-c", &script, "sh", program])
-            .args(argv);
-        command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
-        self.start(command, &self.place.path().join("original.log"))
+        let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
+        self.starts_in_image(&script, program, &argv)
     }
 
     /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, whose
@@ -370,25 +366,22 @@ impl Site {
 
     /// A shell's commands that execute their arguments in a service's root file system.
     fn in_image(&self, daemon: &Daemon, service: &str) -> anyhow::Result<String> {
-        let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
-        let config = manifest["config"]["digest"].as_str().context("a config")?;
-        let config = daemon.get_json(&format!("/v2/{service}/blobs/{config}"))?;
-        let diffs = config["rootfs"]["diff_ids"].as_array().context("layers")?;
-        let root = self.place.path().join("root");
-        std::fs::create_dir_all(&root)?;
-        let layers = diffs.iter().rev().filter_map(|diff| diff.as_str());
-        let layers: Vec<PathBuf> = layers
-            .map(|diff| layer(&daemon.home, diff))
-            .collect::<anyhow::Result<_>>()?;
-        let lowers: Vec<String> = layers
-            .iter()
-            .map(|layer| layer.display().to_string())
-            .collect();
-        Ok(format!(
-            "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
-            lowers.join(":"),
-            root = root.display(),
-        ))
+        in_image(daemon, service, &self.place.path().join("root"))
+    }
+
+    /// Starts a program in a root file system, by commands of [`in_image`].
+    pub fn starts_in_image(
+        &self,
+        script: &str,
+        program: &str,
+        argv: &[String],
+    ) -> anyhow::Result<Running> {
+        let mut command = Command::new("unshare");
+        command
+            .args(["--mount", "sh", "-c", script, "sh", program])
+            .args(argv);
+        command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
+        self.start(command, &self.place.path().join("original.log"))
     }
 
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {
@@ -406,6 +399,34 @@ impl Site {
             log: log.to_owned(),
         })
     }
+}
+
+/// A shell's commands that execute their arguments in a service's root file system, which is mounted at `root`; for a mount namespace of
+/// its own.
+pub fn in_image(daemon: &Daemon, service: &str, root: &Path) -> anyhow::Result<String> {
+    let config = image_config(daemon, service)?;
+    let diffs = config["rootfs"]["diff_ids"].as_array().context("layers")?;
+    std::fs::create_dir_all(root)?;
+    let layers = diffs.iter().rev().filter_map(|diff| diff.as_str());
+    let layers: Vec<PathBuf> = layers
+        .map(|diff| layer(&daemon.home, diff))
+        .collect::<anyhow::Result<_>>()?;
+    let lowers: Vec<String> = layers
+        .iter()
+        .map(|layer| layer.display().to_string())
+        .collect();
+    Ok(format!(
+        "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
+        lowers.join(":"),
+        root = root.display(),
+    ))
+}
+
+/// The configuration of a service's image (OCI image specification, config.md).
+pub fn image_config(daemon: &Daemon, service: &str) -> anyhow::Result<serde_json::Value> {
+    let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
+    let config = manifest["config"]["digest"].as_str().context("a config")?;
+    daemon.get_json(&format!("/v2/{service}/blobs/{config}"))
 }
 
 /// Where a layer is extracted.

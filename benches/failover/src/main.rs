@@ -29,6 +29,7 @@ const PICTURES: usize = 30;
 const BADNESS: Badness = Badness {
     rate: 2000,
     delay: 100,
+    jitter: 0,
     loss: 0.01,
     limit: 100,
 };

@@ -18,6 +18,7 @@ use support::site::{Site, string};
 const NETWORK: Badness = Badness {
     rate: 20_000,
     delay: 5,
+    jitter: 0,
     loss: 0.0,
     limit: 1000,
 };

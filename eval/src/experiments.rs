@@ -1,0 +1,7 @@
+//! The experiments, one file each: how it is measured, and what the report says of it.
+
+pub mod benches;
+pub mod map;
+pub mod memory;
+pub mod outsourcing;
+pub mod transparency;

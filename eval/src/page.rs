@@ -1,0 +1,477 @@
+//! The report as one HTML file: nothing is fetched and nothing is run, so it can be sent as it is.
+
+use crate::section::{Figure, Image, Missing, Section, Table};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use std::fmt::Write;
+
+/// Light and dark as the reader's system is. Drawings keep their white ground.
+const STYLE: &str = "\
+:root { color-scheme: light dark; --ground: #fff; --ink: #1b1f24; --quiet: #57606a; --line: #d0d7de; --box: #f6f8fa; --link: #0550ae; --warn: #b35900; }
+@media (prefers-color-scheme: dark) {
+  :root { --ground: #14171c; --ink: #e6e8eb; --quiet: #9aa4b0; --line: #3a424c; --box: #1d2229; --link: #7db8ff; --warn: #e69f00; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 64rem; padding: 1rem; background: var(--ground); color: var(--ink); font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: break-word; }
+h1 { font-size: 1.6rem; line-height: 1.25; }
+h2 { font-size: 1.3rem; line-height: 1.3; margin-top: 2.5rem; }
+h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
+a { color: var(--link); }
+p, li, figcaption { max-width: 48rem; }
+p, ul { margin: 0.25rem 0 0.75rem; }
+ul { padding-left: 1.25rem; }
+nav ul { list-style: none; padding: 0; }
+nav h2 { margin-top: 1rem; }
+small, header p, caption, figcaption { color: var(--quiet); }
+main > section { border-top: 1px solid var(--line); }
+.table { overflow-x: auto; margin: 0.75rem 0 1.25rem; }
+table { border-collapse: collapse; font-size: 0.9rem; }
+caption { text-align: left; padding-bottom: 0.25rem; }
+th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.75rem 0.3rem 0; text-align: left; vertical-align: top; min-width: 4rem; overflow-wrap: normal; }
+thead th { background: var(--box); }
+tbody th { font-weight: normal; }
+.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+thead .number { white-space: normal; }
+figure { margin: 1rem 0 1.5rem; }
+figure svg, figure img { display: block; max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
+.drawing { overflow-x: auto; }
+.drawing svg { min-width: 34rem; }
+figcaption { font-size: 0.9rem; margin-top: 0.35rem; }
+.missing { border-left: 4px solid var(--warn); background: var(--box); padding: 0.1rem 1rem; margin: 1rem 0; }
+.missing h3 { margin-top: 0.75rem; }
+@media print { main > section { break-before: page; } .table { overflow: visible; } }
+";
+
+/// The page. `machine` is where it was measured, `made` when; `reproduced` lists what could not be reproduced here, its
+/// stand-in, and the reason.
+pub fn render(
+    sections: &[Section],
+    machine: &str,
+    made: &str,
+    reproduced: &[(String, String, String)],
+) -> String {
+    let mut page = format!(
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta name=\"color-scheme\" content=\"light dark\">\n\
+         <title>Cloudroid: the published experiments on one machine</title>\n\
+         <style>\n{STYLE}</style>\n</head>\n<body>\n<header>\n\
+         <h1>Cloudroid: the published experiments on one machine</h1>\n\
+         <p>Measured on {}.<br>Made on {}.</p>\n\
+         <p>Measured numbers are computed from what the experiments recorded. Ratios are those of this machine.</p>\n</header>\n",
+        escaped(machine),
+        escaped(made)
+    );
+    contents(&mut page, sections, reproduced);
+    page.push_str("<main>\n");
+    for section in sections {
+        show(&mut page, section);
+    }
+    if sections.is_empty() {
+        page.push_str("<p>Nothing was measured.</p>\n");
+    }
+    if !reproduced.is_empty() {
+        page.push_str("<section id=\"reproduced\">\n<h2>What could not be reproduced here</h2>\n");
+        let mut table = Table::new(
+            "What the publication used, and what stands for it",
+            ["published", "stand-in", "reason"],
+        );
+        for (what, instead, why) in reproduced {
+            table.push([what, instead, why]);
+        }
+        tabulate(&mut page, &table);
+        page.push_str("</section>\n");
+    }
+    page.push_str("</main>\n</body>\n</html>\n");
+    page
+}
+
+fn put(page: &mut String, text: std::fmt::Arguments) {
+    // Writing to a String does not fail.
+    let _ = page.write_fmt(text);
+}
+
+/// Text as it may stand in an element or in a quoted attribute.
+fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            // HTML has no way to write control characters.
+            other if other.is_control() && !other.is_whitespace() => out.push('\u{fffd}'),
+            other => out.push(other),
+        }
+    }
+    out
+}
+
+/// The anchor of a section, or of a figure: letters, digits and dashes.
+fn anchor(kind: &str, id: &str) -> String {
+    let plain = id.chars().map(|character| {
+        if character.is_ascii_alphanumeric() {
+            character.to_ascii_lowercase()
+        } else {
+            '-'
+        }
+    });
+    format!("{kind}-{}", plain.collect::<String>())
+}
+
+fn contents(page: &mut String, sections: &[Section], reproduced: &[(String, String, String)]) {
+    page.push_str("<nav aria-label=\"Contents\">\n<h2>Contents</h2>\n<ul>\n");
+    for section in sections {
+        let missing = match section.missing.len() {
+            0 => String::new(),
+            1 => " <small>(1 thing was not measured)</small>".to_owned(),
+            more => format!(" <small>({more} things were not measured)</small>"),
+        };
+        put(
+            page,
+            format_args!(
+                "<li><a href=\"#{}\">{}. {}</a>{missing}</li>\n",
+                anchor("section", &section.id),
+                section.number,
+                escaped(&section.title)
+            ),
+        );
+    }
+    if !reproduced.is_empty() {
+        page.push_str("<li><a href=\"#reproduced\">What could not be reproduced here</a></li>\n");
+    }
+    page.push_str("</ul>\n</nav>\n");
+}
+
+fn show(page: &mut String, section: &Section) {
+    let anchor = anchor("section", &section.id);
+    put(
+        page,
+        format_args!(
+            "<section id=\"{anchor}\" aria-labelledby=\"{anchor}-title\">\n<h2 id=\"{anchor}-title\">{}. {}</h2>\n",
+            section.number,
+            escaped(&section.title)
+        ),
+    );
+    if !section.published.is_empty() {
+        put(
+            page,
+            format_args!(
+                "<h3>Published</h3>\n<p>{}</p>\n",
+                escaped(&section.published)
+            ),
+        );
+    }
+    sentences(page, "What is different here", &section.differs);
+    let measured = !(section.tables.is_empty() && section.figures.is_empty());
+    if measured {
+        page.push_str("<h3>Measured</h3>\n");
+    }
+    for table in &section.tables {
+        tabulate(page, table);
+    }
+    for figure in &section.figures {
+        picture(page, figure);
+    }
+    sentences(page, "Findings", &section.findings);
+    missing(page, &section.missing);
+    if !measured && section.findings.is_empty() && section.missing.is_empty() {
+        page.push_str("<p>Nothing was measured.</p>\n");
+    }
+    page.push_str("</section>\n");
+}
+
+fn sentences(page: &mut String, heading: &str, sentences: &[String]) {
+    if sentences.is_empty() {
+        return;
+    }
+    put(page, format_args!("<h3>{heading}</h3>\n<ul>\n"));
+    for sentence in sentences {
+        put(page, format_args!("<li>{}</li>\n", escaped(sentence)));
+    }
+    page.push_str("</ul>\n");
+}
+
+fn missing(page: &mut String, missing: &[Missing]) {
+    if missing.is_empty() {
+        return;
+    }
+    page.push_str("<div class=\"missing\">\n<h3>What was not measured</h3>\n<ul>\n");
+    for Missing { what, why, next } in missing {
+        put(
+            page,
+            format_args!(
+                "<li><strong>{}</strong><br>Why: {}<br>Next step: {}</li>\n",
+                escaped(what),
+                escaped(why),
+                escaped(next)
+            ),
+        );
+    }
+    page.push_str("</ul>\n</div>\n");
+}
+
+/// A cell that is read as a number.
+fn is_number(cell: &str) -> bool {
+    let digits = cell.trim_start_matches(['-', '−', '+', '<', '>', '≤', '≥', '~', ' ']);
+    digits.starts_with(|first: char| first.is_ascii_digit())
+}
+
+/// The box can be scrolled by keyboard, too, because it can have the focus.
+fn tabulate(page: &mut String, table: &Table) {
+    put(
+        page,
+        format_args!(
+            "<div class=\"table\" role=\"region\" tabindex=\"0\" aria-label=\"{caption}\">\n<table>\n<caption>{caption}</caption>\n<thead><tr>",
+            caption = escaped(&table.caption)
+        ),
+    );
+    // A column is aligned to the right if every cell that says something is a number.
+    let numbers: Vec<bool> = (0..table.head.len())
+        .map(|column| {
+            let cells = table.rows.iter().filter_map(|row| row.get(column));
+            let mut said = cells.filter(|cell| !matches!(cell.as_str(), "" | "-" | "–" | "—"));
+            column > 0 && said.all(|cell| is_number(cell))
+        })
+        .collect();
+    let class = |column: usize| match numbers.get(column) {
+        Some(true) => " class=\"number\"",
+        _ => "",
+    };
+    for (column, name) in table.head.iter().enumerate() {
+        put(
+            page,
+            format_args!("<th scope=\"col\"{}>{}</th>", class(column), escaped(name)),
+        );
+    }
+    page.push_str("</tr></thead>\n<tbody>\n");
+    for row in &table.rows {
+        page.push_str("<tr>");
+        for (column, cell) in row.iter().enumerate() {
+            let cell = escaped(cell);
+            if column == 0 {
+                put(page, format_args!("<th scope=\"row\">{cell}</th>"));
+            } else {
+                put(page, format_args!("<td{}>{cell}</td>", class(column)));
+            }
+        }
+        page.push_str("</tr>\n");
+    }
+    if table.rows.is_empty() {
+        put(
+            page,
+            format_args!(
+                "<tr><td colspan=\"{}\">nothing was measured</td></tr>\n",
+                table.head.len().max(1)
+            ),
+        );
+    }
+    page.push_str("</tbody>\n</table>\n</div>\n");
+}
+
+fn picture(page: &mut String, figure: &Figure) {
+    let anchor = anchor("figure", &figure.id);
+    let caption = escaped(&figure.caption);
+    put(page, format_args!("<figure id=\"{anchor}\">\n"));
+    match &figure.image {
+        Image::Svg(text) => match drawing(text) {
+            Some(svg) => put(
+                page,
+                format_args!(
+                    "<div class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{svg}</div>\n"
+                ),
+            ),
+            None => embed(page, "image/svg+xml", text.as_bytes(), &caption),
+        },
+        Image::Png(bytes) => embed(page, "image/png", bytes, &caption),
+    }
+    put(
+        page,
+        format_args!("<figcaption>{caption}</figcaption>\n</figure>\n"),
+    );
+}
+
+fn embed(page: &mut String, kind: &str, bytes: &[u8], caption: &str) {
+    put(
+        page,
+        format_args!(
+            "<img src=\"data:{kind};base64,{}\" alt=\"{caption}\">\n",
+            STANDARD.encode(bytes)
+        ),
+    );
+}
+
+/// The element of an SVG document that consists of shapes and text alone, as ours do. Any other becomes an image, in
+/// which a browser runs and fetches nothing.
+fn drawing(text: &str) -> Option<&str> {
+    const SHAPES: [&str; 11] = [
+        "svg", "g", "rect", "circle", "ellipse", "line", "polyline", "polygon", "path", "text",
+        "tspan",
+    ];
+    let svg = text.find("<svg").map(|at| text[at..].trim_end())?;
+    if !svg.ends_with("</svg>") && !svg.ends_with("/>") {
+        return None;
+    }
+    let mut depth = 0usize;
+    for (number, tag) in svg.split('<').skip(1).enumerate() {
+        let tag = tag.split_once('>')?.0;
+        let name = tag.trim_matches('/').split_whitespace().next()?;
+        let whole = !tag.contains('\'') && tag.matches('"').count() % 2 == 0;
+        let outside = number > 0 && depth == 0;
+        if !SHAPES.contains(&name) || !whole || outside || tag.split('=').any(acts) {
+            return None;
+        }
+        if tag.starts_with('/') {
+            depth = depth.checked_sub(1)?;
+        } else if !tag.ends_with('/') {
+            depth += 1;
+        }
+    }
+    (depth == 0).then_some(svg)
+}
+
+/// Whether what stands before a `=` ends with the name of an attribute that runs or fetches something.
+fn acts(before: &str) -> bool {
+    let name = before
+        .trim_end()
+        .rsplit(|character: char| !character.is_ascii_alphanumeric())
+        .next()
+        .unwrap_or_default()
+        .to_ascii_lowercase();
+    name.starts_with("on") || name == "href" || name == "style" || before.contains("url(")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const EVIL: &str = "<script>alert(\"1\")</script> & 'x'\u{0}";
+
+    fn evil() -> Section {
+        let mut section = Section::new(3, EVIL, EVIL);
+        section.published = EVIL.into();
+        section.differs.push(EVIL.into());
+        section.findings.push(EVIL.into());
+        section
+            .tables
+            .push(Table::new(EVIL, [EVIL, EVIL]).row([EVIL, EVIL]));
+        section.figures.push(Figure::png(EVIL, EVIL, vec![1, 2, 3]));
+        for svg in [
+            "<svg><script>alert(1)</script></svg>",
+            "<svg onload=\"alert(1)\"></svg>",
+            "<svg><text>a</text></svg><script>alert(1)</script>",
+            "<svg></svg></figure><svg></svg>",
+            "<svg/onload=\"alert(1)\"></svg>",
+            "<svg><rect x=\"1\"onload=\"alert(1)\"/></svg>",
+            "<svg><rect x=\">\" onload=\"alert(1)\"/></svg>",
+            "<svg><rect fill=\"url(http://a)\"/></svg>",
+            "<svg><a href=\"javascript:alert(1)\"></a></svg>",
+            EVIL,
+        ] {
+            section.figures.push(Figure::svg(EVIL, EVIL, svg));
+        }
+        section.missing.push(Missing::new(EVIL, EVIL, EVIL));
+        section
+    }
+
+    #[test]
+    fn everything_is_escaped() {
+        let row = (EVIL.to_owned(), EVIL.to_owned(), EVIL.to_owned());
+        let page = render(&[evil()], EVIL, EVIL, &[row]);
+        assert!(
+            !page.contains("<script") && !page.contains("onload"),
+            "{page}"
+        );
+        assert!(!page.contains('\u{0}') && !page.contains("& '"), "{page}");
+        assert!(
+            page.contains("&lt;script&gt;alert(&quot;1&quot;)&lt;/script&gt; &amp; &#39;x&#39;")
+        );
+        assert_eq!(page.matches("data:image/svg+xml;base64,").count(), 10);
+    }
+
+    #[test]
+    fn nothing_is_fetched() {
+        let page = render(&[evil()], "m", "d", &[]);
+        let sources = page.matches("src=").count();
+        assert_eq!(page.matches("src=\"data:").count(), sources);
+        for word in ["<link", "@import", "url("] {
+            assert!(!page.contains(word), "{word}");
+        }
+    }
+
+    #[test]
+    fn a_plot_is_inline() {
+        let plot = crate::plots::lines(
+            "t",
+            "x",
+            "y < z",
+            &[crate::plots::Series::new(
+                "one",
+                vec![(0.0, 1.0), (1.0, 2.0)],
+            )],
+            false,
+        )
+        .expect("it is drawn");
+        let mut section = Section::new(2, "rrt", "RRT");
+        section
+            .figures
+            .push(Figure::svg("fig-5", "by request", plot));
+        let page = render(&[section], "m", "d", &[]);
+        assert!(page.contains("<figure id=\"figure-fig-5\">"), "{page}");
+        assert!(
+            page.contains("role=\"img\" aria-label=\"by request\"><svg "),
+            "{page}"
+        );
+        assert!(
+            page.contains("<figcaption>by request</figcaption>"),
+            "{page}"
+        );
+        assert!(!page.contains("data:"), "{page}");
+    }
+
+    #[test]
+    fn every_part_is_shown() {
+        let mut section = Section::new(9, "isolation", "Several robots");
+        section.published = "as published".into();
+        section.differs.push("two cores".into());
+        section.findings.push("worse than hoped, because".into());
+        section
+            .tables
+            .push(Table::new("RRT", ["set-up", "RRT (s)", "note"]).row(["none", "0.20", "n"]));
+        section
+            .missing
+            .push(Missing::new("8 neighbours", "out of memory", "more memory"));
+        let row = ("GPU".into(), "CPU".into(), "there is none".into());
+        let page = render(&[section], "2 × some processor", "2026-11-25", &[row]);
+        for wanted in [
+            "<html lang=\"en\">",
+            "href=\"#section-isolation\"",
+            "id=\"section-isolation\"",
+            "(1 thing was not measured)",
+            "as published",
+            "<li>two cores</li>",
+            "<li>worse than hoped, because</li>",
+            "<th scope=\"col\" class=\"number\">RRT (s)</th><th scope=\"col\">note</th>",
+            "<th scope=\"row\">none</th><td class=\"number\">0.20</td><td>n</td>",
+            "<strong>8 neighbours</strong><br>Why: out of memory<br>Next step: more memory",
+            "<th scope=\"row\">GPU</th><td>CPU</td><td>there is none</td>",
+            "2 × some processor",
+            "2026-11-25",
+        ] {
+            assert!(page.contains(wanted), "{wanted}: {page}");
+        }
+    }
+
+    #[test]
+    fn what_is_empty_is_said() {
+        assert!(render(&[], "m", "d", &[]).contains("Nothing was measured."));
+        let mut section = Section::new(1, "a", "A");
+        let page = render(std::slice::from_ref(&section), "m", "d", &[]);
+        assert!(page.contains("Nothing was measured."));
+        section.tables.push(Table::new("t", ["a", "b"]));
+        let page = render(&[section], "m", "d", &[]);
+        assert!(page.contains("<td colspan=\"2\">nothing was measured</td>"));
+    }
+}

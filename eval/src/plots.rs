@@ -1,0 +1,299 @@
+//! Plots as SVG, drawn by the crate plotters: measured numbers go in, the text of one document comes out.
+//!
+//! Every plot has a white ground, so that it can be read in light and dark pages, and colours that colour-blind people
+//! tell apart (Okabe and Ito, "Color Universal Design", 2008); a series also has a marker of its own. Values that are
+//! not finite are left out, and so is what a logarithmic axis has no place for: the plot says how many. A plot of
+//! nothing says that nothing was measured.
+
+mod axis;
+mod bars;
+mod canvas;
+mod series;
+mod timeline;
+
+use anyhow::Result;
+
+/// Points that belong together.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Its name in the legend.
+    pub name: String,
+    /// (x, y), in the units of the axes.
+    pub points: Vec<(f64, f64)>,
+}
+
+impl Series {
+    /// A series of these points.
+    pub fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            name: name.into(),
+            points,
+        }
+    }
+}
+
+/// One bar.
+#[derive(Debug, Clone)]
+pub struct Bar {
+    /// The bars beside which it stands; groups stand in the order in which they are first named.
+    pub group: String,
+    /// Its name in the legend; one name has one colour.
+    pub name: String,
+    /// Its height, in the unit of the axis.
+    pub value: f64,
+    /// Where the whisker begins and ends, in the same unit.
+    pub spread: Option<(f64, f64)>,
+}
+
+/// What [`timeline`] draws.
+#[derive(Debug, Clone, Default)]
+pub struct Banded {
+    /// (x, y, class), in the units of the axes; the class is an index into `classes`.
+    pub points: Vec<(f64, f64, usize)>,
+    /// The classes' names in the legend.
+    pub classes: Vec<String>,
+    /// Ranges of x that are shaded.
+    pub bad: Vec<(f64, f64)>,
+    /// Horizontal lines, with what they mean.
+    pub levels: Vec<(f64, String)>,
+    /// (x, Q), drawn in a strip below; without any there is no strip.
+    pub q: Vec<(f64, f64)>,
+}
+
+/// Lines through the points, in their order; a value that is left out interrupts its line. `x` and `y` name the axes,
+/// with their units.
+pub fn lines(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
+    series::lines(title, (x, y), series, log_y)
+}
+
+/// Points without lines.
+pub fn points(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
+    series::points(title, (x, y), series, log_y)
+}
+
+/// Trajectories: lines, a metre of x as long as a metre of y.
+pub fn map(title: &str, x: &str, y: &str, series: &[Series]) -> Result<String> {
+    series::map(title, (x, y), series)
+}
+
+/// The empirical cumulative distribution of each series: for each value, the share of the series (%) that is at most as
+/// large. `x` names the axis, with its unit. Values that have no place on the axis, such as infinite ones, still count
+/// in the shares; those that are not numbers do not.
+pub fn distribution(
+    title: &str,
+    x: &str,
+    series: &[(String, Vec<f64>)],
+    log_x: bool,
+) -> Result<String> {
+    series::distribution(title, x, series, log_x)
+}
+
+/// Bars in groups, with whiskers and their value above. `y` names the axis, with its unit.
+pub fn bars(title: &str, y: &str, bars: &[Bar], log_y: bool) -> Result<String> {
+    bars::draw(title, y, bars, log_y)
+}
+
+/// Points by class over a shaded ground, on a logarithmic axis, with levels across and Q below. `x` and `y` name the
+/// axes, with their units.
+pub fn timeline(title: &str, x: &str, y: &str, banded: &Banded) -> Result<String> {
+    timeline::draw(title, (x, y), banded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn count(text: &str, what: &str) -> usize {
+        text.matches(what).count()
+    }
+
+    fn series(points: &[(f64, f64)]) -> Vec<Series> {
+        vec![Series::new("one", points.to_vec())]
+    }
+
+    /// Every kind, of nothing and of values that cannot be drawn.
+    #[test]
+    fn nothing_measured_is_said() {
+        let unusable = [
+            (f64::NAN, 1.0),
+            (1.0, f64::INFINITY),
+            (f64::NEG_INFINITY, 2.0),
+        ];
+        for given in [Vec::new(), series(&[]), series(&unusable)] {
+            for text in [
+                lines("t", "x", "y", &given, false),
+                lines("t", "x", "y", &given, true),
+                points("t", "x", "y", &given, false),
+                map("t", "x (m)", "y (m)", &given),
+            ] {
+                let text = text.expect("it is drawn");
+                assert!(text.contains("nothing was measured"), "{text}");
+            }
+        }
+        let bar = |value| Bar {
+            group: "g".into(),
+            name: "n".into(),
+            value,
+            spread: Some((f64::NAN, 1.0)),
+        };
+        for given in [vec![], vec![bar(f64::NAN), bar(f64::INFINITY)]] {
+            let text = bars("t", "y", &given, false).expect("it is drawn");
+            assert!(text.contains("nothing was measured"), "{text}");
+        }
+        for given in [
+            vec![],
+            vec![("a".to_owned(), vec![])],
+            vec![("a".to_owned(), vec![f64::NAN])],
+        ] {
+            let text = distribution("t", "x", &given, true).expect("it is drawn");
+            assert!(text.contains("nothing was measured"), "{text}");
+        }
+        let text = timeline("t", "x", "y", &Banded::default()).expect("it is drawn");
+        assert!(text.contains("nothing was measured"), "{text}");
+    }
+
+    /// One point, equal points, huge and tiny numbers: ranges without a width must not stop a plot.
+    #[test]
+    fn degenerate_ranges_are_drawn() {
+        for given in [
+            vec![(1.0, 1.0)],
+            vec![(0.0, 0.0), (0.0, 0.0)],
+            vec![(-5.0, -5.0), (-5.0, -5.0)],
+            vec![(1e300, 1e-300), (-1e300, 1e300)],
+            vec![(f64::MAX, f64::MIN), (f64::MIN, f64::MAX)],
+            vec![(f64::MIN_POSITIVE, f64::MIN_POSITIVE), (0.0, 1e-310)],
+            vec![(1e15, 1.0), (1e15 + 1.0, 1.0 + f64::EPSILON)],
+        ] {
+            let given = series(&given);
+            for text in [
+                lines("t", "x", "y", &given, false),
+                lines("t", "x", "y", &given, true),
+                points("t", "x", "y", &given, true),
+                map("t", "x (m)", "y (m)", &given),
+            ] {
+                let text = text.expect("it is drawn");
+                assert!(text.starts_with("<svg") && !text.contains("NaN"), "{text}");
+            }
+        }
+    }
+
+    #[test]
+    fn titles_and_names_are_escaped() {
+        let text = lines("a < b & \"c\"", "x", "y", &series(&[(1.0, 2.0)]), false).expect("drawn");
+        assert!(text.contains("a &lt; b &amp; &quot;c&quot;"), "{text}");
+    }
+
+    #[test]
+    fn what_is_left_out_is_counted() {
+        let given = series(&[(1.0, 2.0), (2.0, f64::NAN), (3.0, 0.0), (4.0, 3.0)]);
+        let linear = lines("t", "x", "y", &given, false).expect("it is drawn");
+        assert!(linear.contains("1 value is left out"), "{linear}");
+        let logarithmic = points("t", "x", "y", &given, true).expect("it is drawn");
+        assert!(
+            logarithmic.contains("2 values are left out"),
+            "{logarithmic}"
+        );
+    }
+
+    /// Three points, of which the middle one is not known: no line crosses the gap.
+    #[test]
+    fn a_line_stops_where_a_value_is_left_out() {
+        let whole = lines(
+            "t",
+            "x",
+            "y",
+            &series(&[(0.0, 1.0), (1.0, 2.0), (2.0, 3.0)]),
+            false,
+        )
+        .expect("it is drawn");
+        let broken = lines(
+            "t",
+            "x",
+            "y",
+            &series(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0)]),
+            false,
+        )
+        .expect("it is drawn");
+        assert!(count(&whole, "stroke=\"#0072B2\"") > count(&broken, "stroke=\"#0072B2\""));
+    }
+
+    #[test]
+    fn bars_show_their_values_and_groups() {
+        let bar = |group: &str, name: &str, value, spread| Bar {
+            group: group.into(),
+            name: name.into(),
+            value,
+            spread,
+        };
+        for log in [false, true] {
+            let text = bars(
+                "t",
+                "RRT (s)",
+                &[
+                    bar("Pi", "native", 12.34, Some((11.0, 14.0))),
+                    bar("Pi", "LAN", 0.5, None),
+                    bar("ultrabook", "native", 3.0, None),
+                ],
+                log,
+            )
+            .expect("it is drawn");
+            for wanted in ["12.3", "0.500", "3.00", "Pi", "ultrabook", "native", "LAN"] {
+                assert!(text.contains(&format!("\n{wanted}\n")), "{wanted}: {text}");
+            }
+        }
+    }
+
+    #[test]
+    fn bars_of_nothing_and_below_nothing_are_drawn() {
+        for values in [
+            vec![0.0, 0.0],
+            vec![-1.0, -2.0],
+            vec![0.0, 5.0],
+            vec![1e299, -1e-299],
+        ] {
+            let given: Vec<Bar> = values
+                .iter()
+                .map(|value| Bar {
+                    group: "g".into(),
+                    name: "n".into(),
+                    value: *value,
+                    spread: Some((value - 1.0, f64::INFINITY)),
+                })
+                .collect();
+            for log in [false, true] {
+                let text = bars("t", "y", &given, log).expect("it is drawn");
+                assert!(!text.contains("nothing was measured"), "{text}");
+                assert!(count(&text, "<rect") > values.len(), "{text}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_timeline_has_a_strip_only_for_q() {
+        let mut given = Banded {
+            points: vec![(1.0, 0.2, 0), (2.0, 5.0, 1), (3.0, 0.3, 9)],
+            classes: vec!["cloud".into(), "local".into()],
+            bad: vec![(1.5, 2.5)],
+            levels: vec![(0.5, "T_desire".into()), (1.0, "T_max".into())],
+            q: vec![],
+        };
+        let without = timeline("t", "request", "RRT (s)", &given).expect("it is drawn");
+        assert!(without.contains("T_desire") && !without.contains("\nQ\n"));
+        given.q = vec![(1.0, 10.0), (2.0, 4.0), (3.0, f64::NAN)];
+        let with = timeline("t", "request", "RRT (s)", &given).expect("it is drawn");
+        assert!(with.contains("\nQ\n"), "{with}");
+    }
+
+    /// Of 1, 2, 2 and 4, three quarters are at most 2; of these and an unanswered one, three fifths are.
+    #[test]
+    fn shares_are_of_all_values() {
+        assert_eq!(
+            series::shares(&[4.0, 1.0, 2.0, 2.0]),
+            [(1.0, 25.0), (2.0, 75.0), (4.0, 100.0)]
+        );
+        assert_eq!(
+            series::shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
+            [(1.0, 20.0), (2.0, 60.0), (4.0, 80.0)]
+        );
+    }
+}

@@ -1,0 +1,245 @@
+//! Plots of series: lines, points, trajectories and distributions.
+
+use super::Series;
+use super::axis::Axis;
+use super::canvas::{
+    Area, Chart, Entry, HEIGHT, Head, Sides, Sign, WIDTH, chart, colour, document, entries,
+    left_out, mark, nothing, stroke,
+};
+use anyhow::Result;
+use std::collections::HashSet;
+
+/// Up to so many points of a line, all have markers.
+const FEW: usize = 30;
+/// Of a line of more points, so many have.
+const MARKERS: usize = 10;
+/// Shown pixels below the plot that [`chart`] takes for the horizontal axis.
+const AXIS: f64 = 48.0;
+/// Of a map's plot, in shown pixels.
+const MAP_HEIGHT: (f64, f64) = (220.0, 640.0);
+
+#[derive(Clone, Copy, PartialEq)]
+enum Shape {
+    Lines,
+    Points,
+}
+
+/// Positions on both axes; none for what has no place.
+type Placed = Vec<Option<(f64, f64)>>;
+
+pub(super) fn lines(
+    title: &str,
+    names: (&str, &str),
+    series: &[Series],
+    log: bool,
+) -> Result<String> {
+    plain(title, names, series, log, Shape::Lines)
+}
+
+pub(super) fn points(
+    title: &str,
+    names: (&str, &str),
+    series: &[Series],
+    log: bool,
+) -> Result<String> {
+    plain(title, names, series, log, Shape::Points)
+}
+
+fn plain(
+    title: &str,
+    names: (&str, &str),
+    series: &[Series],
+    log: bool,
+    shape: Shape,
+) -> Result<String> {
+    let usable = usable(series, log);
+    let x = Axis::over(usable.iter().map(|point| point.0), false);
+    let y = Axis::over(usable.iter().map(|point| point.1), log);
+    let omitted = count(series) - usable.len();
+    let (Some(x), Some(y)) = (x, y) else {
+        return nothing(title, omitted);
+    };
+    let placed: Vec<Placed> = series
+        .iter()
+        .map(|one| place(&one.points, &x, &y))
+        .collect();
+    let sign = match shape {
+        Shape::Lines => Sign::Line,
+        Shape::Points => Sign::Point,
+    };
+    let head = Head::new(title, legend(series, sign), WIDTH);
+    document(&head, (WIDTH, HEIGHT), left_out(omitted), |area| {
+        let rows = (head.height, head.height + HEIGHT - 12);
+        let chart = chart(area, rows, &Sides::of(&y), (&x, names.0), (&y, names.1))?;
+        draw(area, &chart, &placed, shape)
+    })
+}
+
+pub(super) fn map(title: &str, names: (&str, &str), series: &[Series]) -> Result<String> {
+    let usable = usable(series, false);
+    let x = Axis::over(usable.iter().map(|point| point.0), false);
+    let y = Axis::over(usable.iter().map(|point| point.1), false);
+    let omitted = count(series) - usable.len();
+    let (Some(x), Some(y)) = (x, y) else {
+        return nothing(title, omitted);
+    };
+    let sides = Sides::of(&y);
+    let width = f64::from(WIDTH - sides.left - sides.right);
+    let height = (width * (y.high - y.low) / (x.high - x.low)).clamp(MAP_HEIGHT.0, MAP_HEIGHT.1);
+    // Metres for each pixel: of the direction that needs more.
+    let metres = ((x.high - x.low) / width).max((y.high - y.low) / height);
+    let around = |axis: &Axis, pixels: f64| {
+        let middle = axis.low / 2.0 + axis.high / 2.0;
+        Axis::between(
+            middle - metres * pixels / 2.0,
+            middle + metres * pixels / 2.0,
+        )
+    };
+    let (x, y) = (around(&x, width), around(&y, height));
+    let placed: Vec<Placed> = series
+        .iter()
+        .map(|one| place(&one.points, &x, &y))
+        .collect();
+    let head = Head::new(title, legend(series, Sign::Line), WIDTH);
+    let plot = (height + AXIS) as u32;
+    document(&head, (WIDTH, plot + 12), left_out(omitted), |area| {
+        let rows = (head.height, head.height + plot);
+        let chart = chart(area, rows, &sides, (&x, names.0), (&y, names.1))?;
+        draw(area, &chart, &placed, Shape::Lines)
+    })
+}
+
+pub(super) fn distribution(
+    title: &str,
+    name: &str,
+    series: &[(String, Vec<f64>)],
+    log: bool,
+) -> Result<String> {
+    let values = || series.iter().flat_map(|one| one.1.iter().copied());
+    let y = Axis::between(0.0, 102.0);
+    let Some(x) = Axis::over(values(), log) else {
+        return nothing(title, values().count());
+    };
+    let omitted = values().filter(|value| x.position(*value).is_none());
+    let omitted = omitted.count();
+    let unknown = values().filter(|value| value.is_nan()).count();
+    let note = left_out(unknown).or((omitted > 0).then(|| {
+        format!("{omitted} of the values have no place on the axis, but count in the shares")
+    }));
+    let placed: Vec<Placed> = series.iter().map(|one| steps(&one.1, &x)).collect();
+    let names = series.iter().map(|one| one.0.as_str());
+    let head = Head::new(title, entries(names, Sign::Line), WIDTH);
+    document(&head, (WIDTH, HEIGHT), note, |area| {
+        let rows = (head.height, head.height + HEIGHT - 12);
+        let vertical = (&y, "share of values at most as large (%)");
+        let chart = chart(area, rows, &Sides::of(&y), (&x, name), vertical)?;
+        draw(area, &chart, &placed, Shape::Lines)
+    })
+}
+
+/// Each finite value once, with the share (%) of all numbers that is at most as large.
+pub(super) fn shares(values: &[f64]) -> Vec<(f64, f64)> {
+    let mut sorted: Vec<f64> = values
+        .iter()
+        .copied()
+        .filter(|value| !value.is_nan())
+        .collect();
+    sorted.sort_by(f64::total_cmp);
+    let all = sorted.len() as f64;
+    let mut shares: Vec<(f64, f64)> = Vec::new();
+    for (index, value) in sorted.into_iter().enumerate() {
+        let share = 100.0 * (index + 1) as f64 / all;
+        match shares.last_mut() {
+            Some(last) if last.0 == value => last.1 = share,
+            _ => shares.push((value, share)),
+        }
+    }
+    shares.retain(|(value, _)| value.is_finite());
+    shares
+}
+
+/// The distribution as a line that rises at each value.
+fn steps(values: &[f64], x: &Axis) -> Placed {
+    let mut below = 0.0;
+    let mut placed = Vec::new();
+    for (value, share) in shares(values) {
+        if let Some(position) = x.position(value) {
+            placed.push(Some((position, below)));
+            placed.push(Some((position, share)));
+        }
+        below = share;
+    }
+    placed
+}
+
+/// A single series needs no legend unless it has a name.
+fn legend(series: &[Series], sign: Sign) -> Vec<Entry<'_>> {
+    let mut entries = entries(series.iter().map(|one| one.name.as_str()), sign);
+    entries.retain(|entry| !entry.name.is_empty());
+    entries
+}
+
+fn count(series: &[Series]) -> usize {
+    series.iter().map(|one| one.points.len()).sum()
+}
+
+/// The points whose both coordinates have a place.
+fn usable(series: &[Series], log: bool) -> Vec<(f64, f64)> {
+    let fits = |value: f64, log| Axis::over([value], log).is_some();
+    series
+        .iter()
+        .flat_map(|one| one.points.iter().copied())
+        .filter(|point| fits(point.0, false) && fits(point.1, log))
+        .collect()
+}
+
+fn place(points: &[(f64, f64)], x: &Axis, y: &Axis) -> Placed {
+    points
+        .iter()
+        .map(|point| Some((x.position(point.0)?, y.position(point.1)?)))
+        .collect()
+}
+
+fn draw(area: &Area, chart: &Chart, placed: &[Placed], shape: Shape) -> Result<()> {
+    for (index, points) in placed.iter().enumerate() {
+        let pixels: Vec<Option<(i32, i32)>> = points
+            .iter()
+            .map(|point| point.map(|at| chart.backend_coord(&at)))
+            .collect();
+        match shape {
+            Shape::Lines => line(area, &pixels, index, placed.len())?,
+            Shape::Points => {
+                let mut drawn = HashSet::new();
+                for at in pixels.into_iter().flatten() {
+                    if drawn.insert(at) {
+                        mark(area, at, index, 3)?;
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+fn line(area: &Area, pixels: &[Option<(i32, i32)>], index: usize, of: usize) -> Result<()> {
+    for part in pixels.split(Option::is_none) {
+        let mut path: Vec<(i32, i32)> = part.iter().copied().flatten().collect();
+        path.dedup();
+        stroke(area, &path, colour(index), 2)?;
+    }
+    let known: Vec<(i32, i32)> = pixels.iter().copied().flatten().collect();
+    let (every, first) = match known.len() {
+        // Markers of several lines stand at different places, so that lines that coincide are still seen.
+        count if count > FEW => {
+            let every = (count / MARKERS).max(1);
+            (every, every * index / of.max(1))
+        }
+        _ => (1, 0),
+    };
+    if known.len() <= FEW || of > 1 {
+        for at in known.into_iter().skip(first).step_by(every) {
+            mark(area, at, index, 4)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,232 @@
+//! Recorded inputs, as a robot plays them: the messages of one topic are its requests, all others go with them.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, ensure};
+use bytes::{Buf, Bytes};
+use ros::bag::{self, Recorded};
+
+/// Of pictures.
+const SIZE: (u32, u32) = (640, 480);
+/// Between two pictures, nanoseconds.
+const PERIOD: u64 = 100_000_000;
+
+/// A recording.
+#[derive(Debug, Clone)]
+pub struct Recording {
+    /// In the order of their times.
+    messages: Vec<Recorded>,
+}
+
+/// One request, and what was recorded before it since the one before.
+pub struct Step<'a> {
+    /// Other topics' messages.
+    pub before: Vec<&'a Recorded>,
+    /// The request.
+    pub request: &'a Recorded,
+    /// Seconds from the recording's first message.
+    pub at: f64,
+}
+
+impl Recording {
+    /// Reads a rosbag file that is not compressed, or a file that ends with `.raw`: pictures of 640x480, bgr8, one after the other, ten
+    /// a second.
+    pub fn read(path: &Path) -> Result<Self> {
+        let named = || path.display().to_string();
+        let file = Bytes::from(std::fs::read(path).with_context(named)?);
+        if path.extension().is_some_and(|ending| ending == "raw") {
+            return Ok(pictures(&file));
+        }
+        let mut messages = bag::read(&file, usize::MAX).with_context(named)?;
+        messages.sort_by_key(|message| message.time);
+        ensure!(!messages.is_empty(), "{}: no message is in it", named());
+        Ok(Self { messages })
+    }
+
+    /// The types of its topics, each once, but of those named.
+    pub fn topics(&self, without: &[String]) -> Vec<&Recorded> {
+        let mut topics: Vec<&Recorded> = Vec::new();
+        for message in &self.messages {
+            let known = topics.iter().any(|one| one.topic == message.topic);
+            if !known && !without.iter().any(|name| **name == *message.topic) {
+                topics.push(message);
+            }
+        }
+        topics
+    }
+
+    /// The messages of `topic` as requests; what follows the last of them is left out.
+    pub fn steps(&self, topic: &str) -> Vec<Step<'_>> {
+        let first = self.messages[0].time;
+        let mut steps = Vec::new();
+        let mut before = Vec::new();
+        for message in &self.messages {
+            if *message.topic != *topic {
+                before.push(message);
+                continue;
+            }
+            steps.push(Step {
+                before: std::mem::take(&mut before),
+                request: message,
+                at: (message.time - first) as f64 / 1e9,
+            });
+        }
+        steps
+    }
+
+    /// Positions that were recorded on a topic of `geometry_msgs/PoseStamped`: seconds, x and y in metres.
+    pub fn positions(&self, topic: &str) -> Vec<(f64, f64, f64)> {
+        let first = self.messages[0].time;
+        let of = self.messages.iter().filter(|one| *one.topic == *topic);
+        let position = |one: &Recorded| {
+            let at = (one.time - first) as f64 / 1e9;
+            pose(&one.bytes).map(|[x, y, _]| (at, x, y))
+        };
+        of.filter_map(position).collect()
+    }
+
+    /// Made of these messages.
+    #[cfg(test)]
+    pub fn of(messages: Vec<Recorded>) -> Self {
+        Self { messages }
+    }
+}
+
+/// Pictures as messages.
+fn pictures(file: &Bytes) -> Recording {
+    let (width, height) = SIZE;
+    let topic: Arc<str> = Arc::from("/image");
+    let wire_type = Arc::new(support::people::image_type());
+    let pictures = file.chunks_exact((width * height * 3) as usize);
+    let messages = pictures.zip(0..).map(|(pixels, number)| Recorded {
+        topic: topic.clone(),
+        wire_type: wire_type.clone(),
+        time: u64::from(number) * PERIOD,
+        bytes: support::people::picture(number, SIZE, pixels),
+    });
+    Recording {
+        messages: messages.collect(),
+    }
+}
+
+/// `std_msgs/Header` at the beginning of a serialized message.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Header {
+    /// Seconds and nanoseconds.
+    pub stamp: (u32, u32),
+    /// Where what follows it begins, bytes.
+    pub end: usize,
+}
+
+/// Reads it; none where the message is too short.
+pub fn header(bytes: &[u8]) -> Option<Header> {
+    let word = |at: usize| {
+        let bytes = bytes.get(at..at + 4)?;
+        Some(u32::from_le_bytes(bytes.try_into().ok()?))
+    };
+    let end = 16 + word(12)? as usize;
+    (end <= bytes.len()).then_some(Header {
+        stamp: (word(4)?, word(8)?),
+        end,
+    })
+}
+
+/// Of a `geometry_msgs/PoseStamped` or a message that begins like one: x, y (metres) and heading (radians).
+pub fn pose(bytes: &[u8]) -> Option<[f64; 3]> {
+    let numbers = numbers(bytes, header(bytes)?.end, 7)?;
+    let [x, y, _, qx, qy, qz, qw] = numbers[..] else {
+        return None;
+    };
+    let heading = f64::atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz));
+    Some([x, y, heading])
+}
+
+/// So many float64 from there on.
+pub fn numbers(bytes: &[u8], from: usize, count: usize) -> Option<Vec<f64>> {
+    let mut rest = bytes.get(from..from + count * 8)?;
+    Some((0..count).map(|_| rest.get_f64_le()).collect())
+}
+
+/// A message whose header's stamp is `number` seconds, so that its answer can be told from others.
+pub fn restamped(bytes: &Bytes, number: u32) -> Option<Bytes> {
+    header(bytes)?;
+    let mut message = bytes.to_vec();
+    message[4..8].copy_from_slice(&number.to_le_bytes());
+    message[8..12].copy_from_slice(&[0; 4]);
+    Some(message.into())
+}
+
+/// One message, for tests.
+#[cfg(test)]
+pub fn recorded(topic: &str, seconds: u64, bytes: &[u8]) -> Recorded {
+    Recorded {
+        topic: Arc::from(topic),
+        wire_type: Arc::new(ros::bus::WireType::any()),
+        time: seconds * 1_000_000_000,
+        bytes: Bytes::copy_from_slice(bytes),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stamped(number: u32, rest: &[f64]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        for word in [7, number, 5, 3] {
+            bytes.extend(u32::to_le_bytes(word));
+        }
+        bytes.extend(b"map");
+        rest.iter()
+            .for_each(|number| bytes.extend(number.to_le_bytes()));
+        bytes
+    }
+
+    #[test]
+    fn a_header_is_read_up_to_its_end() {
+        let bytes = stamped(42, &[1.0]);
+        let header = header(&bytes).expect("a header");
+        assert_eq!((header.stamp, header.end), ((42, 5), 19));
+        assert_eq!(super::header(&bytes[..18]), None);
+        assert_eq!(numbers(&bytes, header.end, 1), Some(vec![1.0]));
+        assert_eq!(numbers(&bytes, header.end, 2), None);
+    }
+
+    #[test]
+    fn a_pose_is_a_position_and_a_heading() {
+        // A quarter turn about the vertical axis.
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let bytes = stamped(1, &[1.0, 2.0, 3.0, 0.0, 0.0, half, half]);
+        let [x, y, heading] = pose(&bytes).expect("a pose");
+        assert_eq!((x, y), (1.0, 2.0));
+        assert!((heading - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
+    }
+
+    #[test]
+    fn requests_have_what_was_recorded_before_them() {
+        let recording = Recording::of(vec![
+            recorded("/odom", 10, b"a"),
+            recorded("/scan", 11, b"b"),
+            recorded("/odom", 12, b"c"),
+            recorded("/odom", 13, b"d"),
+            recorded("/scan", 14, b"e"),
+            recorded("/odom", 15, b"f"),
+        ]);
+        let steps = recording.steps("/scan");
+        let told: Vec<_> = steps
+            .iter()
+            .map(|step| (step.before.len(), step.at))
+            .collect();
+        assert_eq!(told, [(1, 1.0), (2, 4.0)]);
+        assert_eq!(recording.topics(&["/odom".to_owned()]).len(), 1);
+    }
+
+    #[test]
+    fn an_answer_is_told_by_the_stamp() {
+        let bytes = Bytes::from(stamped(42, &[]));
+        let again = restamped(&bytes, 1001).expect("it has a header");
+        assert_eq!(header(&again).map(|header| header.stamp), Some((1001, 0)));
+        assert_eq!(restamped(&Bytes::from_static(b"short"), 1), None);
+    }
+}

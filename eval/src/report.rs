@@ -1,0 +1,104 @@
+//! The files of the report.
+
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, Result};
+use bench_report::Machine;
+use serde::Serialize;
+
+use crate::page;
+use crate::section::{Image, Section};
+
+/// What could not be had here: the published thing, what stands in for it, and why.
+const STAND_INS: [(&str, &str, &str); 5] = [
+    (
+        "RGBD-SLAM, RTAB-Map, SSD",
+        "laser_slam, graph_slam and object_detector of examples/",
+        "they are not packaged for Debian 12, and their data sets are not in its archive",
+    ),
+    (
+        "a GPU in the cloud",
+        "none: all computes on processor cores",
+        "this machine has none",
+    ),
+    (
+        "a real robot, a Raspberry Pi, an ultrabook",
+        "control groups with a part of a core, in network namespaces",
+        "one machine has to do: ratios are of this machine",
+    ),
+    (
+        "a data centre, wireless networks",
+        "the rest of the machine; delays, rates and losses of packets between namespaces",
+        "one machine has to do",
+    ),
+    (
+        "KinectFusion's SLAMBench",
+        "the same three phases, told by laser_slam",
+        "it needs a depth camera's data set",
+    ),
+];
+
+#[derive(Serialize)]
+struct Whole<'a> {
+    made: String,
+    machine: Machine,
+    sections: &'a [Section],
+}
+
+/// Writes report.html, report.json and one file a figure into `target`; whether nothing is missing.
+pub fn write(target: &Path, sections: &[Section]) -> Result<bool> {
+    let figures = target.join("figures");
+    std::fs::create_dir_all(&figures).with_context(|| figures.display().to_string())?;
+    for figure in sections.iter().flat_map(|section| &section.figures) {
+        let (ending, bytes) = match &figure.image {
+            Image::Svg(text) => ("svg", text.as_bytes()),
+            Image::Png(bytes) => ("png", &bytes[..]),
+        };
+        std::fs::write(figures.join(format!("{}.{ending}", figure.id)), bytes)?;
+    }
+    let machine = Machine::describe();
+    let told = format!(
+        "{} × {}, {} GiB, {}, Linux {}",
+        machine.processors, machine.processor, machine.memory_gib, machine.system, machine.kernel
+    );
+    let made = date();
+    let stand_ins = STAND_INS
+        .map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
+    let html = target.join("report.html");
+    std::fs::write(&html, page::render(sections, &told, &made, &stand_ins))?;
+    let whole = Whole {
+        made,
+        machine,
+        sections,
+    };
+    std::fs::write(
+        target.join("report.json"),
+        serde_json::to_vec_pretty(&whole)?,
+    )?;
+    summary(sections);
+    println!("the report is {}", html.display());
+    Ok(sections.iter().all(|section| section.missing.is_empty()))
+}
+
+/// The findings, and what is missing.
+fn summary(sections: &[Section]) {
+    for section in sections {
+        println!("{}. {}", section.number, section.title);
+        for finding in &section.findings {
+            println!("   {finding}");
+        }
+        for missing in &section.missing {
+            println!(
+                "   NOT measured: {}: {} ({})",
+                missing.what, missing.why, missing.next
+            );
+        }
+    }
+}
+
+fn date() -> String {
+    let output = Command::new("date").arg("+%Y-%m-%d %H:%M").output();
+    let said = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
+    said.unwrap_or_default()
+}

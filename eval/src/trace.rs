@@ -1,0 +1,87 @@
+//! What a robot has seen of one run: raw, request by request.
+
+use serde::{Deserialize, Serialize};
+
+/// One request and its answer.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Request {
+    /// When it was published, seconds from the run's beginning.
+    pub at: f64,
+    /// When its message was recorded, seconds of the recording.
+    pub stamp: f64,
+    /// Response time of the first answer, seconds; none where no answer came.
+    pub response: Option<f64>,
+    /// What the node itself says that it took.
+    pub phases: Option<Phases>,
+    /// Where the robot is, by the answer: x and y in metres, heading in radians.
+    pub pose: Option<[f64; 3]>,
+    /// Of the answer without its header's sequence number; equal for equal answers.
+    pub digest: Option<u64>,
+}
+
+/// Parts of one computation as SLAMBench divides them (Nardi et al., ICRA 2015), seconds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Phases {
+    /// Reading the input.
+    pub acquisition: f64,
+    /// The algorithm.
+    pub computation: f64,
+    /// Making what is shown.
+    pub rendering: f64,
+}
+
+/// A map that was published.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Grid {
+    /// Cells.
+    pub width: usize,
+    /// Cells.
+    pub height: usize,
+    /// Metres of a cell's side.
+    pub resolution: f64,
+    /// Of the first cell's corner, metres.
+    pub origin: [f64; 2],
+    /// By rows, from the first: -1 unknown, 0 free to 100 occupied.
+    pub cells: Vec<i8>,
+}
+
+/// All of a run.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Trace {
+    /// In the order they were published.
+    pub requests: Vec<Request>,
+    /// Seconds from the first request to the last answer.
+    pub lasted: f64,
+    /// The last map.
+    pub map: Option<Grid>,
+    /// Answers by the local original, where that is known.
+    pub answered_locally: usize,
+    /// How the node ended before its time; none where it went on to the end.
+    pub node_ended: Option<String>,
+}
+
+impl Trace {
+    /// Response times of what was answered, seconds.
+    pub fn responses(&self) -> Vec<f64> {
+        self.requests
+            .iter()
+            .filter_map(|one| one.response)
+            .collect()
+    }
+
+    /// How many were answered.
+    pub fn answered(&self) -> usize {
+        self.responses().len()
+    }
+
+    /// Of the answers that tell them.
+    pub fn phases(&self) -> Vec<Phases> {
+        self.requests.iter().filter_map(|one| one.phases).collect()
+    }
+
+    /// Estimated positions: seconds of the recording, x and y in metres.
+    pub fn trajectory(&self) -> Vec<(f64, f64, f64)> {
+        let pose = |one: &Request| one.pose.map(|[x, y, _]| (one.stamp, x, y));
+        self.requests.iter().filter_map(pose).collect()
+    }
+}
