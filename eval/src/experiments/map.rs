@@ -172,7 +172,7 @@ fn picture(map: &Grid) -> Result<Vec<u8>> {
     for y in (bottom..top).rev() {
         for x in left..right {
             pixels.push(match map.cells.get(y * map.width + x) {
-                Some(cell @ 0..=100) => 255 - (f64::from(*cell) * 2.55) as u8,
+                Some(cell @ 0..=100) => 255 - (f64::from(*cell) * 2.55).round() as u8,
                 _ => 205,
             });
         }
