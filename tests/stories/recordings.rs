@@ -230,7 +230,7 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         (
             &["record", servant, "-o", path_str(&text)],
             1,
-            &["exists", "-o names another file"],
+            &["exists", "-o is to name a new file"],
         ),
         (
             &["record", servant, "-o", path_str(&nowhere)],

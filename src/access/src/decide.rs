@@ -147,6 +147,8 @@ pub fn decide(principal: &Principal, action: Action, object: &Object<'_>) -> Res
 
 fn describe(object: &Object<'_>) -> String {
     match (object.service, object.robot) {
+        // Of none in particular: not even of one that were its own.
+        (Some(""), _) => "any service".to_owned(),
         (Some(service), Some(robot)) => format!("service {service} as robot {robot}"),
         (Some(service), None) => format!("service {service}"),
         (None, _) => "this server as a whole".to_owned(),
@@ -351,6 +353,12 @@ mod tests {
         assert_eq!(
             refused.expect_err("read only").to_string(),
             "me (viewer) may not deploy service in_a"
+        );
+        let any = Object::service("", Some("me"));
+        let refused = decide(&principal(Role::Viewer), Action::Operate, &any);
+        assert_eq!(
+            refused.expect_err("read only").to_string(),
+            "me (viewer) may not operate any service"
         );
         let refused = decide(&Principal::nobody(), Action::Enter, &Object::MACHINE);
         let refused = refused.expect_err("nobody").to_string();

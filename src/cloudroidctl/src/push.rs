@@ -160,6 +160,15 @@ impl Push {
         let wait = self.wait;
         let service = self.publish(client, format).await?;
         let name = &service.summary.name;
+        let newest = service.revisions.iter().map(|one| one.number).max();
+        if let Some(newest) =
+            newest.filter(|newest| rolls_out && *newest != service.summary.revision)
+        {
+            output::complain(&format!(
+                "revision {newest} is tried beside the current one, {}, of which the following is",
+                service.summary.revision
+            ));
+        }
         if format == Format::Table {
             services::show(&service)?;
         }

@@ -44,7 +44,7 @@ impl Record {
         let servant = inside::servant(client, &self.servant).await?;
         let inside = Inside::attach(client, &servant, DEPTH).await?;
         let writer = Writer::create(&self.output)
-            .context("-o names another file, which is not there yet")?;
+            .context("-o is to name a new file, in a directory that exists")?;
         output::complain(&format!(
             "recording {servant} into {}; Ctrl-C ends it",
             self.output.display()

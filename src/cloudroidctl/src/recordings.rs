@@ -95,9 +95,14 @@ impl List {
         let path = format!("/api/v1/recordings?{}", asked.join("&"));
         let all: Vec<Recording> = client.get(&path).await?;
         if all.is_empty() && format == Format::Table {
-            output::complain(
-                "there are no recordings; with seconds of [black_box] in the configuration the daemon writes one when a robot waits longer than it accepts",
-            );
+            output::complain(match asked.is_empty() {
+                true => {
+                    "there are no recordings: where [black_box] has seconds in the daemon's configuration, it writes one when a robot waits longer than it accepts, and by: cloudroidctl recordings take SERVANT"
+                }
+                false => {
+                    "there are no recordings of that service and robot; without --service and --robot all are listed"
+                }
+            });
         }
         list(&all, format)
     }

@@ -98,17 +98,23 @@ impl Replay {
                 self.file.display()
             );
         }
+        match format {
+            Format::Json => output::json(&published)?,
+            Format::Table => {
+                let mut table = output::Table::new(&["TOPIC", "MESSAGES"]);
+                for (topic, messages) in &published {
+                    table.row([topic.clone(), messages.to_string()]);
+                }
+                table.print()?;
+            }
+        }
         if complaints > 0 {
-            bail!("not all of {} was published", self.file.display());
+            bail!(
+                "not all of {} was published: the words above say why; --topic names what to play, and push --with DEBIAN-PACKAGE adds definitions to an image",
+                self.file.display()
+            );
         }
-        if format == Format::Json {
-            return output::json(&published);
-        }
-        let mut table = output::Table::new(&["TOPIC", "MESSAGES"]);
-        for (topic, messages) in &published {
-            table.row([topic.clone(), messages.to_string()]);
-        }
-        table.print()
+        Ok(())
     }
 }
 

@@ -17,28 +17,28 @@ pub use writer::{Summary, TopicSummary, Writer};
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// It cannot be made, as where there is one of this name.
-    #[error("{} cannot be made: {source}", path.display())]
+    #[error("{} cannot be made: {reason}", path.display())]
     NotMade {
         /// Where.
         path: PathBuf,
         /// Why.
-        source: io::Error,
+        reason: io::Error,
     },
     /// What was written by then stays.
-    #[error("{} cannot be written to its end: {source}; what it holds by now can be read", path.display())]
+    #[error("{} cannot be written to its end: {reason}; what it holds by now can be read", path.display())]
     Unwritable {
         /// Where.
         path: PathBuf,
         /// Why.
-        source: McapError,
+        reason: McapError,
     },
     /// It cannot be opened or read.
-    #[error("{} cannot be read: {source}", path.display())]
+    #[error("{} cannot be read: {reason}", path.display())]
     Unreadable {
         /// Where.
         path: PathBuf,
         /// Why.
-        source: io::Error,
+        reason: io::Error,
     },
     /// It is something else.
     #[error("{} is no MCAP file", path.display())]

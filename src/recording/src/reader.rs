@@ -53,9 +53,9 @@ impl Reader {
     /// # Errors
     /// [`Error::Unreadable`].
     pub fn open(path: &Path) -> Result<Self, Error> {
-        let file = File::open(path).map_err(|source| Error::Unreadable {
+        let file = File::open(path).map_err(|reason| Error::Unreadable {
             path: path.to_owned(),
-            source,
+            reason,
         })?;
         let options = LinearReaderOptions::default().with_record_length_limit(LARGEST);
         Ok(Self {
@@ -93,9 +93,9 @@ impl Reader {
                 None => self.ended = true,
                 Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
                     let read = self.file.read(self.records.insert(wanted));
-                    let read = read.map_err(|source| Error::Unreadable {
+                    let read = read.map_err(|reason| Error::Unreadable {
                         path: path.clone(),
-                        source,
+                        reason,
                     })?;
                     self.records.notify_read(read);
                 }

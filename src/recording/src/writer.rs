@@ -67,9 +67,9 @@ impl Writer {
     pub fn create(path: &Path) -> Result<Self, Error> {
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(path);
-        let file = file.map_err(|source| Error::NotMade {
+        let file = file.map_err(|reason| Error::NotMade {
             path: path.to_owned(),
-            source,
+            reason,
         })?;
         Self::of(path, file)
     }
@@ -79,9 +79,9 @@ impl Writer {
     /// # Errors
     /// [`Error::Unwritable`].
     pub fn of(path: &Path, file: File) -> Result<Self, Error> {
-        let asked = file.try_clone().map_err(|source| Error::NotMade {
+        let asked = file.try_clone().map_err(|reason| Error::NotMade {
             path: path.to_owned(),
-            source,
+            reason,
         })?;
         let options = WriteOptions::new()
             .profile("ros1")
@@ -225,9 +225,9 @@ impl Seek for Whole {
 }
 
 fn unwritable(path: &Path) -> impl FnOnce(McapError) -> Error {
-    |source| Error::Unwritable {
+    |reason| Error::Unwritable {
         path: path.to_owned(),
-        source,
+        reason,
     }
 }
 
