@@ -48,7 +48,7 @@ pub const ALL: [Bench; 5] = [
         number: 9,
         name: "choreographer",
         title: "Robots beside each other",
-        published: "The publication says that servants are isolated, and measured nothing of it.",
+        published: "Robots have servants of their own in the publication, which are isolated from one another.",
         differs: "A promised servant beside greedy neighbours; mixed SLAs with the controller on and off.",
     },
     Bench {
@@ -62,7 +62,7 @@ pub const ALL: [Bench; 5] = [
         number: 11,
         name: "portal",
         title: "What the portal adds",
-        published: "Nothing was published.",
+        published: "The publication has no such figure.",
         differs: "Beside a byte relay and raw TCPROS in the same run.",
     },
 ];

@@ -2,6 +2,7 @@
 
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use crate::cells::{Cells, Measured};
 use crate::examples::{ALL, Example, Where, Workshop};
@@ -22,7 +23,7 @@ pub struct Compared {
     native: Trace,
     again: Trace,
     outsourced: Trace,
-    /// Of the robot's own program, before and after (SHA-256 by sha256sum of coreutils).
+    /// Of the robot's own program, before and after (SHA-256).
     application: [String; 2],
 }
 
@@ -60,11 +61,8 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
 
 /// Of this program, which is the robot's application.
 fn checksum() -> Result<String> {
-    let output = std::process::Command::new("sha256sum")
-        .arg(std::env::current_exe()?)
-        .output()?;
-    let said = String::from_utf8_lossy(&output.stdout);
-    Ok(said.split(' ').next().unwrap_or_default().to_owned())
+    let program = std::fs::read(std::env::current_exe()?)?;
+    Ok(format!("{:x}", Sha256::digest(program)))
 }
 
 /// How much two runs differ: requests that both answered, those whose answers were equal to the byte, and the largest distance of
@@ -89,7 +87,7 @@ fn difference(one: &Trace, other: &Trace) -> (usize, usize, Option<f64>) {
 pub fn section(runs: &Runs) -> Section {
     let mut section = Section::new(1, "transparency", "Unmodified packages answer the same");
     section.published = "The publication's packages and robot applications were not modified; their results are said to be the same.".to_owned();
-    section.differs = vec!["Each package is asked the same requests twice on the robot, and through the stub: what the two runs on the robot differ by is its own difference from run to run.".to_owned()];
+    section.differs = vec!["Each package is asked the same requests twice on the robot, and through the stub: what the two runs on the robot differ by is its own difference from run to run.".to_owned(), "The robot's application is the evaluation's own node: one program, which knows neither where the package runs nor that there are stubs. Its checksum shows that nothing was written into it meanwhile, and no more.".to_owned()];
     let mut table = Table::new(
         "Answers to the same requests",
         [
