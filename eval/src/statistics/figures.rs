@@ -1,0 +1,209 @@
+//! What describes values: means, deviations, quantiles, and lines through them.
+
+use std::iter::repeat_n;
+
+/// Resamples of a bootstrap.
+const RESAMPLES: usize = 2000;
+
+/// The arithmetic mean.
+pub fn mean(values: &[f64]) -> Option<f64> {
+    let sum: f64 = values.iter().sum();
+    (!values.is_empty() && !sum.is_nan()).then(|| sum / values.len() as f64)
+}
+
+/// The standard deviation of a sample: the sum of squares is divided by n − 1 (Bessel's correction). None of fewer than
+/// two values.
+pub fn standard_deviation(values: &[f64]) -> Option<f64> {
+    let mean = mean(values).filter(|mean| mean.is_finite())?;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
+}
+
+/// The value that a fraction `0.0..=1.0` of the values stays below, between two values by linear interpolation: type 7
+/// of Hyndman and Fan, "Sample Quantiles in Statistical Packages", The American Statistician 50 (1996).
+pub fn quantile(values: &[f64], fraction: f64) -> Option<f64> {
+    of_sorted(&sorted(values)?, fraction)
+}
+
+/// The quantile of one half.
+pub fn median(values: &[f64]) -> Option<f64> {
+    quantile(values, 0.5)
+}
+
+/// The values in ascending order; none if one is not a number.
+fn sorted(values: &[f64]) -> Option<Vec<f64>> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    (!sorted.iter().any(|value| value.is_nan())).then_some(sorted)
+}
+
+fn of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
+    let last = sorted.len().checked_sub(1)?;
+    let place = fraction.clamp(0.0, 1.0) * last as f64;
+    let lower = *sorted.get(place.floor() as usize)?;
+    let upper = *sorted.get(place.ceil() as usize)?;
+    // The difference of two infinite values is not a number.
+    Some(if lower == upper || place.fract() == 0.0 {
+        lower
+    } else {
+        lower + (upper - lower) * place.fract()
+    })
+}
+
+/// The confidence interval of the median, low and high, by the percentile bootstrap (Efron and Tibshirani, "An
+/// Introduction to the Bootstrap", 1993, chapter 13). `confidence` is between 0 and 1, such as 0.95. The same values
+/// give the same interval.
+pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
+    let values = sorted(values)?;
+    let mut random = Xorshift(0x9e37_79b9_7f4a_7c15);
+    let mut medians = Vec::with_capacity(RESAMPLES);
+    for _ in 0..RESAMPLES {
+        let mut drawn = vec![0; values.len()];
+        for _ in 0..values.len() {
+            drawn[random.below(values.len())] += 1;
+        }
+        let times = values.iter().zip(drawn);
+        let resample: Vec<f64> = times
+            .flat_map(|(value, times)| repeat_n(*value, times))
+            .collect();
+        medians.push(of_sorted(&resample, 0.5)?);
+    }
+    let outside = (1.0 - confidence) / 2.0;
+    Some((
+        quantile(&medians, outside)?,
+        quantile(&medians, 1.0 - outside)?,
+    ))
+}
+
+/// The generator xorshift64* of Vigna, "An experimental exploration of Marsaglia's xorshift generators, scrambled",
+/// ACM Transactions on Mathematical Software 42 (2016).
+struct Xorshift(u64);
+
+impl Xorshift {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
+    }
+
+    /// A number below `limit`, which is small: its bias is not noticed.
+    fn below(&mut self, limit: usize) -> usize {
+        ((u128::from(self.next()) * limit as u128) >> 64) as usize
+    }
+}
+
+/// A straight line, and how well it describes the points.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Line {
+    /// Units of y for each unit of x.
+    pub slope: f64,
+    /// y where x is nothing.
+    pub intercept: f64,
+    /// The share of the variance of y that the line explains, 0 to 1 (coefficient of determination).
+    pub r2: f64,
+}
+
+/// The line through (x, y) with the least sum of squared vertical distances. None unless there are two different x.
+pub fn least_squares(points: &[(f64, f64)]) -> Option<Line> {
+    let of = |which: fn(&(f64, f64)) -> f64| mean(&points.iter().map(which).collect::<Vec<_>>());
+    let (x, y) = (of(|point| point.0)?, of(|point| point.1)?);
+    let sum = |term: &dyn Fn(f64, f64) -> f64| -> f64 {
+        points
+            .iter()
+            .map(|point| term(point.0 - x, point.1 - y))
+            .sum()
+    };
+    let (xx, xy, yy) = (
+        sum(&|dx, _| dx * dx),
+        sum(&|dx, dy| dx * dy),
+        sum(&|_, dy| dy * dy),
+    );
+    (xx > 0.0 && yy.is_finite()).then(|| Line {
+        slope: xy / xx,
+        intercept: y - xy / xx * x,
+        // A line through points of one height leaves nothing unexplained.
+        r2: if yy > 0.0 { xy * xy / (xx * yy) } else { 1.0 },
+    })
+}
+
+/// The root of the mean squared difference of pairs, such as (predicted, measured), in their unit.
+pub fn root_mean_square_error(pairs: &[(f64, f64)]) -> Option<f64> {
+    let squares: Vec<f64> = pairs.iter().map(|pair| (pair.0 - pair.1).powi(2)).collect();
+    mean(&squares).map(f64::sqrt)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::near;
+    use super::*;
+
+    #[test]
+    fn means_and_deviations() {
+        // 2, 4, 4, 4, 5, 5, 7, 9: mean 5, sum of squares 32.
+        let values = [2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0];
+        assert_eq!(mean(&values), Some(5.0));
+        near(
+            standard_deviation(&values).expect("values"),
+            (32.0f64 / 7.0).sqrt(),
+        );
+        assert_eq!(mean(&[]), None);
+        assert_eq!(mean(&[1.0, f64::NAN]), None);
+        assert_eq!(standard_deviation(&[1.0]), None);
+        assert_eq!(standard_deviation(&[1.0, f64::INFINITY]), None);
+    }
+
+    #[test]
+    fn quantiles_are_interpolated() {
+        let values = [40.0, 10.0, 30.0, 20.0];
+        assert_eq!(median(&values), Some(25.0));
+        // (4 − 1) · 0.9 = 2.7: seven tenths of the way from 30 to 40.
+        near(quantile(&values, 0.9).expect("values"), 37.0);
+        assert_eq!(quantile(&values, 0.0), Some(10.0));
+        assert_eq!(quantile(&values, 1.0), Some(40.0));
+        assert_eq!(quantile(&[7.0], 0.3), Some(7.0));
+        assert_eq!(quantile(&[], 0.5), None);
+        assert_eq!(median(&[1.0, f64::NAN]), None);
+    }
+
+    #[test]
+    fn unanswered_requests_keep_their_place_in_quantiles() {
+        let values = [1.0, f64::INFINITY, 2.0, f64::INFINITY];
+        assert_eq!(quantile(&values, 0.9), Some(f64::INFINITY));
+        assert_eq!(quantile(&values, 1.0 / 3.0), Some(2.0));
+        assert_eq!(median(&values), Some(f64::INFINITY));
+    }
+
+    /// For the median of 1…100 the interval by order statistics (binomial) is from the 40th to the 61st value.
+    #[test]
+    fn the_medians_interval_is_that_of_order_statistics() {
+        let values: Vec<f64> = (1..=100).map(f64::from).collect();
+        let (low, high) = median_interval(&values, 0.95).expect("values");
+        assert!((38.0..=43.0).contains(&low), "{low}");
+        assert!((58.0..=63.0).contains(&high), "{high}");
+        assert_eq!(median_interval(&values, 0.95), Some((low, high)));
+        assert_eq!(median_interval(&[3.0, 3.0], 0.95), Some((3.0, 3.0)));
+        assert_eq!(median_interval(&[], 0.95), None);
+    }
+
+    #[test]
+    fn a_line_is_fitted() {
+        // Means 2 and 4: Σdx² = 2, Σdx·dy = 3, Σdy² = 6.
+        let line = least_squares(&[(1.0, 2.0), (2.0, 5.0), (3.0, 5.0)]).expect("two x");
+        near(line.slope, 1.5);
+        near(line.intercept, 1.0);
+        near(line.r2, 9.0 / (2.0 * 6.0));
+        assert_eq!(least_squares(&[(1.0, 2.0), (1.0, 3.0)]), None);
+        assert_eq!(least_squares(&[]), None);
+        let level = least_squares(&[(0.0, 3.0), (1.0, 3.0)]).expect("two x");
+        assert_eq!((level.slope, level.r2), (0.0, 1.0));
+    }
+
+    #[test]
+    fn errors_are_squared() {
+        // Differences 3 and −4: √(25 / 2).
+        let error = root_mean_square_error(&[(5.0, 2.0), (1.0, 5.0)]).expect("pairs");
+        near(error, 12.5f64.sqrt());
+        assert_eq!(root_mean_square_error(&[]), None);
+    }
+}
