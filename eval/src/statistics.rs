@@ -8,6 +8,7 @@ mod models;
 mod paths;
 mod pictures;
 mod queues;
+mod random;
 
 pub use figures::{
     Line, least_squares, mean, median, median_interval, quantile, root_mean_square_error,
@@ -16,7 +17,10 @@ pub use figures::{
 pub use models::{Point, RrtModel};
 pub use paths::{TrajectoryError, trajectory_error};
 pub use pictures::psnr;
-pub use queues::{Closed, machine_repair, nodes_needed, response, robots_per_node, waiting_time};
+pub use queues::{
+    Closed, Node, Observed, machine_repair, nodes_needed, response, robots_per_node, waiting_time,
+};
+pub use random::Xorshift;
 
 #[cfg(test)]
 #[track_caller]

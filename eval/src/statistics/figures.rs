@@ -2,6 +2,8 @@
 
 use std::iter::repeat_n;
 
+use super::random::Xorshift;
+
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
 
@@ -55,7 +57,7 @@ fn of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
 /// give the same interval.
 pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
     let values = sorted(values)?;
-    let mut random = Xorshift(0x9e37_79b9_7f4a_7c15);
+    let mut random = Xorshift::new(0);
     let mut medians = Vec::with_capacity(RESAMPLES);
     for _ in 0..RESAMPLES {
         let mut drawn = vec![0; values.len()];
@@ -73,24 +75,6 @@ pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
         quantile(&medians, outside)?,
         quantile(&medians, 1.0 - outside)?,
     ))
-}
-
-/// The generator xorshift64* of Vigna, "An experimental exploration of Marsaglia's xorshift generators, scrambled",
-/// ACM Transactions on Mathematical Software 42 (2016).
-struct Xorshift(u64);
-
-impl Xorshift {
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
-    }
-
-    /// A number below `limit`, which is small: its bias is not noticed.
-    fn below(&mut self, limit: usize) -> usize {
-        ((u128::from(self.next()) * limit as u128) >> 64) as usize
-    }
 }
 
 /// A straight line, and how well it describes the points.

@@ -23,25 +23,45 @@ pub struct Closed {
     pub busy: f64,
 }
 
-/// The closed queue of `robots` that each wait for their answer, pause for `think` seconds and ask again, at a node of
-/// `cores` where a request takes `service` core seconds ("machine repair"). Less than one core is a slower server.
-/// Without robots nothing is used, and a request takes `service`.
+/// The closed queue of `robots` that each wait for their answer, pause for `think` seconds on average and ask again, at a
+/// node of `cores` where a request takes `service` core seconds on average ("machine repair"). A request uses one core at
+/// most; less than one core is a slower server. Without robots nothing is used, and a request takes `service`.
 ///
-/// One core is computed by exact Mean Value Analysis (Reiser and Lavenberg, "Mean-Value Analysis of Closed Multichain
-/// Queuing Networks", Journal of the ACM 27, 1980), several by Seidmann's transformation (Seidmann, Schweitzer and
-/// Shalev-Oren, "Computerized Closed Queueing Network Models of Flexible Manufacturing Systems", Large Scale Systems 12,
-/// 1987): one server that is as fast as all cores, and a delay for the rest of a request's time. With exponential
-/// service times that is exact for one core and for one robot, and nearly so when all cores are busy; between, the tests
-/// find it within a fifth of the exact response time.
+/// Solved exactly, by the probabilities of each number of requests at the node: the finite source queue M/M/c//N
+/// (Kleinrock, "Queueing Systems", volume 1, 1975, section 3.10). As a scheduler shares the cores among all requests, the
+/// distributions of service and pause do not matter, only their means (Cohen, "The Multiple Phase Service Network with
+/// Generalized Processor Sharing", Acta Informatica 12, 1979).
 pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> Closed {
-    Analysis::new(cores, service, think)
-        .take(robots.try_into().unwrap_or(usize::MAX))
-        .last()
-        .unwrap_or(Closed {
+    if robots == 0 {
+        return Closed {
             response: service / cores.min(1.0),
             throughput: 0.0,
             busy: 0.0,
-        })
+        };
+    }
+    // Logarithms of the weights of 0, 1, 2, ... requests at the node: the weights themselves leave the range of numbers.
+    let think = think.max(1e-12);
+    let mut weights = vec![0.0f64];
+    let mut weight = 0.0;
+    for requests in 1..=robots {
+        let thinking = (robots - requests + 1) as f64;
+        weight += (thinking / think * service / cores.min(requests as f64)).ln();
+        weights.push(weight);
+    }
+    let most = weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let (mut all, mut used) = (0.0, 0.0);
+    for (requests, weight) in weights.iter().enumerate() {
+        let share = (weight - most).exp();
+        all += share;
+        used += share * cores.min(requests as f64);
+    }
+    let used = used / all;
+    let throughput = used / service;
+    Closed {
+        response: robots as f64 / throughput - think,
+        throughput,
+        busy: used / cores,
+    }
 }
 
 /// The response time of [`machine_repair`], seconds.
@@ -51,10 +71,23 @@ pub fn response(robots: u64, cores: f64, service: f64, think: f64) -> f64 {
 
 /// How many robots a node can serve, of `robots`, so that their mean response time is at most `t_max` seconds.
 pub fn robots_per_node(robots: u64, cores: f64, service: f64, think: f64, t_max: f64) -> u64 {
-    Analysis::new(cores, service, think)
-        .take(robots.try_into().unwrap_or(usize::MAX))
-        .take_while(|closed| closed.response <= t_max)
-        .count() as u64
+    // The more robots, the longer each waits.
+    let in_time = |robots: u64| response(robots, cores, service, think) <= t_max;
+    let (mut enough, mut beyond) = (0, 1);
+    while beyond <= robots && in_time(beyond) {
+        enough = beyond;
+        beyond *= 2;
+    }
+    beyond = beyond.min(robots + 1);
+    while beyond - enough > 1 {
+        let middle = enough + (beyond - enough) / 2;
+        if in_time(middle) {
+            enough = middle;
+        } else {
+            beyond = middle;
+        }
+    }
+    enough
 }
 
 /// How many nodes of `cores_per_node` serve `robots` so that their mean response time is at most `t_max` seconds, if
@@ -67,45 +100,112 @@ pub fn nodes_needed(robots: u64, cores_per_node: f64, service: f64, think: f64, 
     }
 }
 
-/// The recurrence of Mean Value Analysis: the results for one robot, two, and so on.
-struct Analysis {
-    /// Seconds at the server for each request.
-    queued: f64,
-    /// Seconds of a request's service during which it keeps nobody waiting.
-    beside: f64,
-    think: f64,
-    robots: f64,
-    /// Requests at the server, on average.
-    length: f64,
+/// What was measured of robots at a node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observed {
+    /// How many asked.
+    pub robots: u64,
+    /// The mean of their response times, seconds.
+    pub response: f64,
+    /// The share of the cores' time that their requests used, 0 to 1.
+    pub busy: f64,
 }
 
-impl Analysis {
-    fn new(cores: f64, service: f64, think: f64) -> Self {
-        Self {
-            queued: service / cores,
-            beside: service * (cores - 1.0).max(0.0) / cores,
+/// A node whose robots wait in the queue of [`machine_repair`] and, beside it, for what uses no core of the node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Node {
+    /// Its cores.
+    pub cores: f64,
+    /// Seconds for which a robot pauses between an answer and its next request, on average.
+    pub think: f64,
+    /// Core seconds of each request.
+    pub service: f64,
+    /// Seconds of each response that use no core, such as those on a network.
+    pub delay: f64,
+}
+
+/// Points on each axis of the grid in which [`Node::fit`] looks, rounds, and how much smaller the grid is in each.
+const GRID: (i32, u32, f64) = (10, 9, 0.4);
+
+impl Node {
+    /// The `service` and `delay` whose response times and use of cores are nearest to what was observed: the sum of
+    /// squared logarithms of the ratios is least. None of observations that are not positive numbers, or of fewer than two.
+    pub fn fit(observed: &[Observed], cores: f64, think: f64) -> Option<Self> {
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        let usable =
+            |one: &Observed| one.robots > 0 && positive(one.response) && positive(one.busy);
+        if observed.len() < 2 || !observed.iter().all(usable) {
+            return None;
+        }
+        let quickest = observed.iter().map(|one| one.response);
+        let quickest = quickest.fold(f64::INFINITY, f64::min);
+        let node = |service: f64, delay: f64| Self {
+            cores,
             think,
-            robots: 0.0,
-            length: 0.0,
+            service,
+            delay,
+        };
+        // From the logarithm of the service time and the delay, half as wide as the range in which they can be.
+        let (mut service, mut width) = ((quickest * 0.05).ln(), 40f64.ln());
+        let (mut delay, mut height) = (quickest / 2.0, quickest / 2.0);
+        let mut least = f64::INFINITY;
+        for _ in 0..GRID.1 {
+            let middle = (service, delay);
+            for across in -GRID.0..=GRID.0 {
+                for up in -GRID.0..=GRID.0 {
+                    let at = |step: i32| f64::from(step) / f64::from(GRID.0);
+                    let there = (
+                        middle.0 + width * at(across),
+                        (middle.1 + height * at(up)).max(0.0),
+                    );
+                    let error = node(there.0.exp(), there.1).distance(observed);
+                    if error < least {
+                        least = error;
+                        (service, delay) = there;
+                    }
+                }
+            }
+            width *= GRID.2;
+            height *= GRID.2;
+        }
+        Some(node(service.exp(), delay))
+    }
+
+    /// The sum of squared logarithms of what it predicts, divided by what was observed.
+    fn distance(&self, observed: &[Observed]) -> f64 {
+        let terms = observed.iter().map(|one| {
+            let closed = self.at(one.robots);
+            let times = (closed.response / one.response).ln();
+            times.powi(2) + (closed.busy / one.busy).ln().powi(2)
+        });
+        terms.sum()
+    }
+
+    /// What it is like with so many robots; the response time includes the delay.
+    pub fn at(&self, robots: u64) -> Closed {
+        let closed = machine_repair(robots, self.cores, self.service, self.think + self.delay);
+        Closed {
+            response: closed.response + self.delay,
+            ..closed
         }
     }
-}
 
-impl Iterator for Analysis {
-    type Item = Closed;
+    /// How many of so many robots it serves with a mean response time of at most `t_max` seconds.
+    pub fn serves(&self, robots: u64, t_max: f64) -> u64 {
+        robots_per_node(
+            robots,
+            self.cores,
+            self.service,
+            self.think + self.delay,
+            t_max - self.delay,
+        )
+    }
 
-    fn next(&mut self) -> Option<Closed> {
-        self.robots += 1.0;
-        // Who arrives finds what the queue is without them.
-        let at_server = self.queued * (1.0 + self.length);
-        let response = at_server + self.beside;
-        let throughput = self.robots / (response + self.think);
-        self.length = throughput * at_server;
-        Some(Closed {
-            response,
-            throughput,
-            busy: throughput * self.queued,
-        })
+    /// The number of robots from which on they wait for one another rather than for their own requests: where the
+    /// bounds of few and of many robots meet (Denning and Buzen, "The Operational Analysis of Queueing Network Models",
+    /// ACM Computing Surveys 10, 1978).
+    pub fn knee(&self) -> f64 {
+        self.cores * (self.think + self.delay + self.service) / self.service
     }
 }
 
@@ -123,17 +223,14 @@ mod tests {
         assert_eq!(waiting_time(0.0, 1.0, 1.0), 0.0);
     }
 
-    /// The birth-death process of `robots` at `cores` servers with exponential times.
-    fn birth_death(robots: u64, cores: u64, service: f64, think: f64) -> f64 {
-        let mut weight = 1.0;
-        let (mut all, mut throughput) = (1.0, 0.0);
-        for at_node in 1..=robots {
-            let busy = at_node.min(cores) as f64;
-            weight *= (robots - at_node + 1) as f64 / think * service / busy;
-            all += weight;
-            throughput += weight * busy / service;
+    /// Exact Mean Value Analysis of one core (Reiser and Lavenberg, 1980): who arrives finds what the queue is without them.
+    fn one_core(robots: u64, service: f64, think: f64) -> f64 {
+        let (mut response, mut length) = (0.0, 0.0);
+        for robots in 1..=robots {
+            response = service * (1.0 + length);
+            length = robots as f64 / (response + think) * response;
         }
-        robots as f64 / (throughput / all) - think
+        response
     }
 
     /// Two robots, service and pause of 1 s, one core: the states' weights are 1, 2, 2, so four fifths of a request
@@ -145,30 +242,26 @@ mod tests {
         near(closed.throughput, 0.8);
         near(closed.busy, 0.8);
         for robots in [1, 3, 10, 40] {
-            near(
-                response(robots, 1.0, 0.2, 3.0),
-                birth_death(robots, 1, 0.2, 3.0),
-            );
+            near(response(robots, 1.0, 0.2, 3.0), one_core(robots, 0.2, 3.0));
         }
     }
 
+    /// Three robots, service and pause of 1 s, two cores: the states' weights are 1, 3, 3, 1.5, and (3 + 6 + 3) / 8.5
+    /// requests per second are answered.
     #[test]
-    fn several_cores_are_near_the_exact_queue() {
+    fn several_cores_are_exact() {
+        let closed = machine_repair(3, 2.0, 1.0, 1.0);
+        near(closed.throughput, 12.0 / 8.5);
+        near(closed.response, 3.0 * 8.5 / 12.0 - 1.0);
+        near(closed.busy, 6.0 / 8.5);
         near(response(1, 4.0, 0.5, 2.0), 0.5);
         // All busy: 200 robots share what 4 cores answer.
         near(response(200, 4.0, 0.5, 2.0), 200.0 * 0.5 / 4.0 - 2.0);
-        for (robots, cores) in [(4, 2), (10, 2), (20, 4), (40, 8)] {
-            let (approximate, exact) = (
-                response(robots, cores as f64, 0.5, 2.0),
-                birth_death(robots, cores, 0.5, 2.0),
-            );
-            assert!(
-                (approximate / exact - 1.0).abs() < 0.2,
-                "{approximate} for {exact}"
-            );
-        }
         near(response(1, 0.25, 0.5, 2.0), 2.0);
         near(machine_repair(0, 2.0, 0.5, 2.0).response, 0.5);
+        // Nobody pauses: three at two cores.
+        near(response(3, 2.0, 1.0, 0.0), 1.5);
+        assert!(response(5000, 2.0, 0.01, 0.2).is_finite());
     }
 
     /// One core, 1 s of service, 1 s of pause: one robot waits 1 s, two wait 1.5 s, three wait 1 + 0.8 · 1.5 = 2.2 s.
@@ -181,5 +274,59 @@ mod tests {
         assert_eq!(nodes_needed(5, 1.0, 1.0, 1.0, 0.5), u64::MAX);
         assert_eq!(nodes_needed(0, 1.0, 1.0, 1.0, 0.5), 0);
         assert_eq!(nodes_needed(7, 1.0, 1.0, 1.0, 1e9), 1);
+    }
+
+    const NODE: Node = Node {
+        cores: 2.0,
+        think: 0.2,
+        service: 0.01,
+        delay: 0.003,
+    };
+
+    fn observed(robots: &[u64], as_if: impl Fn(u64) -> f64) -> Vec<Observed> {
+        let all = robots.iter().map(|robots| {
+            let closed = NODE.at(*robots);
+            Observed {
+                robots: *robots,
+                response: closed.response * as_if(*robots),
+                busy: closed.busy,
+            }
+        });
+        all.collect()
+    }
+
+    #[test]
+    fn a_nodes_parameters_are_found() {
+        let node = Node::fit(&observed(&[1, 4, 16, 64], |_| 1.0), 2.0, 0.2).expect("four points");
+        assert!((node.service / 0.01 - 1.0).abs() < 0.01, "{node:?}");
+        assert!((node.delay - 0.003).abs() < 0.0003, "{node:?}");
+        for robots in [2, 8, 32, 100] {
+            let (predicted, real) = (node.at(robots).response, NODE.at(robots).response);
+            assert!((predicted / real - 1.0).abs() < 0.03, "{predicted} {real}");
+        }
+        // Of measurements that are a tenth too long or too short.
+        let noisy = observed(
+            &[1, 4, 16, 64],
+            |robots| if robots == 4 { 1.1 } else { 0.9 },
+        );
+        let node = Node::fit(&noisy, 2.0, 0.2).expect("four points");
+        assert!((node.service / 0.01 - 1.0).abs() < 0.1, "{node:?}");
+    }
+
+    #[test]
+    fn nothing_is_fitted_to_what_is_not_there() {
+        assert_eq!(Node::fit(&observed(&[4], |_| 1.0), 2.0, 0.2), None);
+        assert_eq!(Node::fit(&observed(&[1, 4], |_| f64::NAN), 2.0, 0.2), None);
+        assert_eq!(Node::fit(&[], 2.0, 0.2), None);
+    }
+
+    /// 2 cores answer 200 requests a second; one robot asks 1 / 0.213 s.
+    #[test]
+    fn bounds_meet_at_the_knee() {
+        near(NODE.knee(), 200.0 * 0.213);
+        let most = NODE.serves(1000, 0.1);
+        assert!(NODE.at(most).response <= 0.1 && NODE.at(most + 1).response > 0.1);
+        assert_eq!(NODE.serves(7, 0.1), 7);
+        assert_eq!(NODE.serves(7, 0.012), 0);
     }
 }
