@@ -129,6 +129,17 @@ pub struct Report {
     pub machine: Machine,
     /// In the order they were measured.
     pub figures: Vec<Figure>,
+    /// What was to be measured and was not.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// Something that could not be measured on this machine.
+#[derive(Clone, Debug, Serialize)]
+pub struct LeftOut {
+    /// What it is.
+    pub what: String,
+    /// Why.
+    pub why: String,
 }
 
 impl Report {
@@ -138,6 +149,7 @@ impl Report {
             bench: name.to_owned(),
             machine: Machine::describe(),
             figures: Vec::new(),
+            left_out: Vec::new(),
         }
     }
 
@@ -156,6 +168,13 @@ impl Report {
         });
         let last = self.figures.len() - 1;
         &mut self.figures[last]
+    }
+
+    /// Names what could not be measured, and why.
+    pub fn left_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
+        let (what, why) = (what.into(), why.into());
+        eprintln!("{what} is left out: {why}");
+        self.left_out.push(LeftOut { what, why });
     }
 
     /// Whether every figure that had something to reach reached it.
@@ -237,6 +256,18 @@ mod tests {
         assert!(
             table.contains("speed") && table.contains("NOT MET") && table.contains("cold"),
             "{table}"
+        );
+    }
+
+    #[test]
+    fn what_is_left_out_is_in_table_and_file() {
+        let mut report = Report::new("test");
+        report.left_out("a peer", "it is not installed");
+        assert!(table::render(&report).contains("a peer is left out: it is not installed"));
+        let text = serde_json::to_string(&report).expect("JSON");
+        assert!(
+            text.contains(r#""left_out":[{"what":"a peer","why":"it is not installed"}]"#),
+            "{text}"
         );
     }
 }

@@ -83,5 +83,8 @@ pub(crate) fn render(report: &Report) -> String {
         }
         let _ = writeln!(text, "{}", line.trim_end());
     }
+    for one in &report.left_out {
+        let _ = writeln!(text, "{} is left out: {}", one.what, one.why);
+    }
     text
 }

@@ -15,7 +15,7 @@ use crate::cgroups::Cgroups;
 use crate::root::Root;
 
 /// What the container runs, and stays.
-const PROGRAM: [&str; 2] = ["/bin/sleep", "60"];
+pub(crate) const PROGRAM: [&str; 2] = ["/bin/sleep", "60"];
 /// Microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
 

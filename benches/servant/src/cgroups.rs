@@ -3,7 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
+use nix::mount::{MsFlags, mount};
+use nix::sched::{CloneFlags, unshare};
 
 /// A place for one container's cgroup. What is made on the way to it goes when this is dropped.
 pub(crate) struct Cgroups {
@@ -19,6 +21,11 @@ impl Cgroups {
         Ok(Self { path, missing })
     }
 
+    /// The cgroup that is above the container's.
+    pub(crate) fn parent(&self) -> &str {
+        &self.path
+    }
+
     /// The `cgroupsPath` of a container.
     pub(crate) fn of(&self, id: &str) -> String {
         format!("{}/{id}", self.path)
@@ -32,6 +39,25 @@ impl Drop for Cgroups {
             let _ = fs::remove_dir(directory);
         }
     }
+}
+
+/// Where hosts with both versions have version 2.
+const UNIFIED: &str = "/sys/fs/cgroup/unified";
+
+/// Does something in a thread for which a host with both versions of cgroups has version 1 alone: crun refuses others ("cgroups in hybrid mode
+/// not supported"). The mounts are this thread's, and of what it starts.
+pub(crate) fn as_of_one_version<T: Send>(work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
+    let covered = || {
+        unshare(CloneFlags::CLONE_NEWNS).context("a mount namespace for a peer")?;
+        if Path::new(UNIFIED).join("cgroup.procs").exists() {
+            let empty = Some("tmpfs");
+            mount(empty, UNIFIED, empty, MsFlags::empty(), None::<&str>)
+                .with_context(|| format!("covering {UNIFIED}"))?;
+        }
+        work()
+    };
+    std::thread::scope(|scope| scope.spawn(covered).join())
+        .map_err(|_| anyhow!("the thread that starts a peer has panicked"))?
 }
 
 /// The directories, the deepest first, that will be made in the hierarchies.

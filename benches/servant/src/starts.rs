@@ -131,7 +131,11 @@ pub(crate) fn measure(
         Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),
         Contestant::ours(UNLIMITED, |spec| bare::unlimited(&bundle, spec)),
     ];
-    for peer in Peer::installed() {
+    for (peer, there) in Peer::looked_for()? {
+        if let Err(why) = there {
+            report.left_out(peer.name, format!("{why:#}"));
+            continue;
+        }
         let bundle = place.join(peer.name);
         contestants.push(Contestant::peer(peer.name, move |spec| {
             peer.time(&bundle, spec)
@@ -151,7 +155,7 @@ pub(crate) fn measure(
             match (one.start)(&spec) {
                 Ok(time) => one.times.extend((round > 0).then_some(time)),
                 Err(error) if one.optional => {
-                    eprintln!("{} is left out: {error:#}", one.name);
+                    report.left_out(one.name, format!("{error:#}"));
                     contestants.remove(index);
                 }
                 Err(error) => return Err(error.context(one.name)),
