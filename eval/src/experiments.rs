@@ -1,7 +1,9 @@
 //! The experiments, one file each: how it is measured, and what the report says of it.
 
 pub mod benches;
+pub mod cores;
 pub mod map;
 pub mod memory;
 pub mod outsourcing;
+pub mod overhead;
 pub mod transparency;

@@ -11,7 +11,7 @@ use support::daemon::Setup;
 
 use eval::cells::Cells;
 use eval::examples::Workshop;
-use eval::experiments::{benches, map, memory, outsourcing, transparency};
+use eval::experiments::{benches, cores, map, memory, outsourcing, overhead, transparency};
 use eval::section::Section;
 use eval::{report, robot};
 
@@ -104,6 +104,10 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
         ];
         sections.extend(made.into_iter().filter(|section| wanted(section.number)));
     }
+    if wanted(2) {
+        let studies = cores::measure(cells, workshop, arguments.quick)?;
+        sections.push(cores::section(&studies)?);
+    }
     if wanted(3) {
         sections.push(memory::section(&memory::measure(cells, workshop)?));
     }
@@ -115,6 +119,9 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
         )?)?);
     }
     if !arguments.quick {
+        if wanted(11) {
+            sections.push(overhead::section(&overhead::measure(cells)?)?);
+        }
         for bench in benches::ALL.iter().filter(|bench| wanted(bench.number())) {
             sections.push(benches::section(bench, &benches::measure(cells, bench)?));
         }

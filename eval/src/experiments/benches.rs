@@ -29,7 +29,7 @@ impl Bench {
 }
 
 /// In the order of the publication's experiments.
-pub const ALL: [Bench; 5] = [
+pub const ALL: [Bench; 4] = [
     Bench {
         number: 6,
         name: "failover",
@@ -58,56 +58,94 @@ pub const ALL: [Bench; 5] = [
         published: "Starting a servant took over 5 s.",
         differs: "Beside what this distribution has: bare containers by libcontainer, and runtimes of others where they are installed.",
     },
-    Bench {
-        number: 11,
-        name: "portal",
-        title: "What the portal adds",
-        published: "The publication has no such figure.",
-        differs: "Beside a byte relay and raw TCPROS in the same run.",
-    },
 ];
 
 /// What a benchmark writes: `bench_report::Report`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Written {
-    figures: Vec<Figure>,
+    /// In the order in which they were measured.
+    pub figures: Vec<Figure>,
+    /// What could not be measured.
+    #[serde(default)]
+    pub left_out: Vec<LeftOut>,
     /// A drawing, if it makes one.
     #[serde(default)]
     drawing: Option<String>,
 }
 
-#[derive(Debug, Clone, Serialize, Deserialize)]
-struct Figure {
-    figure: String,
-    unit: String,
-    value: Option<f64>,
-    peer: Option<String>,
-    floor: Option<f64>,
+/// One measured number: `bench_report::Figure`.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct Figure {
+    /// What was measured.
+    pub figure: String,
+    /// In what unit.
+    pub unit: String,
+    /// The number.
+    pub value: Option<f64>,
+    /// What it was measured beside.
+    pub peer: Option<String>,
+    /// The peer's number, in the same unit.
+    pub floor: Option<f64>,
     ratio: Option<f64>,
     to_reach: Option<String>,
     met: Option<bool>,
     note: Option<String>,
 }
 
+/// Something that could not be measured on this machine: `bench_report::LeftOut`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// What it is.
+    pub what: String,
+    /// Why.
+    pub why: String,
+}
+
+impl Written {
+    /// Sentences about what was to be reached and was not.
+    pub fn unmet(&self) -> Vec<String> {
+        let unmet = self
+            .figures
+            .iter()
+            .filter(|figure| figure.met == Some(false));
+        let sentence = |figure: &Figure| {
+            format!(
+                "{}: {} {}, which is not {}.",
+                figure.figure,
+                figure.value.map(digits).unwrap_or_default(),
+                figure.unit,
+                figure.to_reach.as_deref().unwrap_or_default()
+            )
+        };
+        unmet.map(sentence).collect()
+    }
+}
+
 /// Runs one, unless that was done before.
 pub fn measure(cells: &Cells, bench: &Bench) -> Result<Measured<Written>> {
-    cells.measure(&format!("bench {}", bench.name), &bench.name, || {
-        let program = binaries::path(&format!("bench-{}", bench.name));
+    part(cells, bench.name, &[])
+}
+
+/// Runs what `arguments` choose of a benchmark, unless that was done before.
+pub fn part(cells: &Cells, name: &str, arguments: &[&str]) -> Result<Measured<Written>> {
+    let cell = [&["bench", name], arguments].concat().join(" ");
+    cells.measure(&cell, &name, || {
+        let program = binaries::path(&format!("bench-{name}"));
         ensure!(
             program.exists(),
             "{} is not built: make eval builds it",
             program.display()
         );
-        let status = Command::new(&program).status()?;
+        let status = Command::new(&program).args(arguments).status()?;
         ensure!(
             status.success(),
             "{} ended with {status}",
             program.display()
         );
-        let file = written(bench.name, "json");
+        let file = written(name, "json");
         let text = std::fs::read(&file).with_context(|| file.display().to_string())?;
         let mut written: Written = serde_json::from_slice(&text)?;
-        written.drawing = std::fs::read_to_string(self::written(bench.name, "svg")).ok();
+        written.drawing = std::fs::read_to_string(self::written(name, "svg")).ok();
         Ok(written)
     })
 }
@@ -164,17 +202,16 @@ pub fn section(bench: &Bench, measured: &Measured<Written>) -> Section {
             .to_owned(),
             figure.note.clone().unwrap_or_default(),
         ]);
-        if figure.met == Some(false) {
-            let value = figure.value.map(digits).unwrap_or_default();
-            section.findings.push(format!(
-                "{}: {value} {}, which is not {}.",
-                figure.figure,
-                figure.unit,
-                figure.to_reach.as_deref().unwrap_or_default()
-            ));
-        }
     }
     section.tables.push(table);
+    section.findings = written.unmet();
+    for one in &written.left_out {
+        section.missing.push(Missing::new(
+            &one.what,
+            &one.why,
+            format!("make bench ONLY={}, then make eval again", bench.name),
+        ));
+    }
     if let Some(drawing) = &written.drawing {
         section.drawing(bench.name, bench.title, drawing.clone());
     }

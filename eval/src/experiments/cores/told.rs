@@ -1,0 +1,411 @@
+//! What the report says of programs with several limits of cores: tables, findings and plots.
+
+use anyhow::Result;
+
+use crate::cells::Measured;
+use crate::plots::{self, Series};
+use crate::section::{Missing, Section, Table};
+use crate::statistics::root_mean_square_error;
+use crate::words::{digits, milliseconds, ratio};
+
+use super::model::{Model, NAMES, bytes, parts};
+use super::{Found, Study, total};
+
+/// Cores for which response times are predicted.
+const MANY: [f64; 4] = [4.0, 8.0, 16.0, 32.0];
+/// The publication's greatest factor (Fig. 5).
+const PUBLISHED: f64 = 25.0;
+
+/// What the report says.
+pub fn section(studies: &[Study]) -> Result<Section> {
+    let mut section = Section::new(
+        2,
+        "cores",
+        "What more cores would give: a model, and its error at points that were held back",
+    );
+    section.published = format!(
+        "Fig. 5 of the publication: outsourced to a cloud of many cores, packages answered up to {PUBLISHED} times as fast as on a Raspberry Pi."
+    );
+    section.differs = differs();
+    let found: Vec<Found> = studies.iter().map(Found::of).collect();
+    section.tables = vec![measured(&found), models(&found), predictions(&found)];
+    for one in &found {
+        findings(&mut section, one);
+        missing(&mut section, one);
+        if let Some(model) = &one.model {
+            let id = one.name().replace([',', ' '], "-").replace("--", "-");
+            section.drawing(
+                format!("cores-{id}"),
+                format!("{}: mean response time by the servant's limit", one.name()),
+                curve(one, model)?,
+            );
+        }
+    }
+    section.drawing(
+        "cores-predicted",
+        "How many times as fast as on the robot itself, by cores of the cloud: predicted, beside the publication's greatest factor",
+        plots::lines(
+            "times as fast as a robot of the class Pi",
+            "cores",
+            "times",
+            &factors(&found),
+            true,
+        )?,
+    );
+    Ok(section)
+}
+
+fn differs() -> Vec<String> {
+    let here = std::thread::available_parallelism().map_or(0, usize::from);
+    vec![
+        format!(
+            "This machine has {here} cores, which robot, daemon and servant share; all above the greatest measured limit is predicted, not measured."
+        ),
+        "Each part of the response time (acquisition, computation and rendering as the package tells them; the rest is transport and waiting) has a model of its own: overhead + work / min(cores, parallel), fitted to means of whole runs.".to_owned(),
+        "A limit of a fraction of a core is not a slow core: the kernel lets the program run at full speed for a part of each tenth of a second and stops it for the rest (CFS bandwidth control). One request may pass without being stopped, the next one waits; only means follow the limit. The same holds for limits between one core and two, and what was measured there says nothing of caches, memory bandwidth or sockets of a machine with many cores.".to_owned(),
+        "Two predictions are given. The cautious one: more cores than were measured give nothing more. The bound: all work of the computation is divided among all cores as it was up to the greatest measured limit, without an end; the package would have to be started with that many threads.".to_owned(),
+        "The model cannot know cores of another speed (the cloud's core is four times the Pi class's quarter here, because it is the same core), a GPU, what several robots do to each other, or another network than the LAN that was measured.".to_owned(),
+    ]
+}
+
+fn measured(found: &[Found]) -> Table {
+    let head = [
+        "program",
+        "cores",
+        "used for",
+        "requests",
+        "bytes a request",
+    ];
+    let tail = ["response time", "model", "model's error"];
+    let mut table = Table::new(
+        "Means by the servant's limit, which was read back from the kernel (milliseconds); robot of the class Pi, LAN",
+        head.into_iter().chain(NAMES).chain(tail),
+    );
+    for one in found {
+        for (cores, measured) in &one.study.runs {
+            let point = one.points.iter().find(|point| point.0 == *cores);
+            let (Some(run), Some((_, parts, fitted))) = (measured.done(), point) else {
+                continue;
+            };
+            let (whole, model) = (total(*parts), one.model.map(|model| model.cautious(*cores)));
+            let mut row = vec![
+                one.name().to_owned(),
+                digits(run.enforced),
+                if *fitted { "fitting" } else { "held back" }.to_owned(),
+                run.trace.answered().to_string(),
+                format!("{:.0}", bytes(&run.trace, &run.cost)),
+            ];
+            row.extend(parts.map(|part| milliseconds(Some(part))));
+            row.extend([Some(whole), model].map(milliseconds));
+            row.push(model.map_or_else(String::new, |model| percent(model / whole - 1.0)));
+            table.push(row);
+        }
+    }
+    table
+}
+
+fn percent(share: f64) -> String {
+    format!("{:+.1} %", 100.0 * share)
+}
+
+fn models(found: &[Found]) -> Table {
+    let mut table = Table::new(
+        "The models: overhead + work / min(cores, parallel)",
+        [
+            "program",
+            "part",
+            "overhead, ms",
+            "work, core ms",
+            "parallel, cores",
+        ],
+    );
+    for one in found {
+        for (name, part) in one
+            .model
+            .iter()
+            .flat_map(|model| NAMES.iter().zip(model.parts))
+        {
+            table.push([
+                one.name().to_owned(),
+                (*name).to_owned(),
+                milliseconds(Some(part.overhead)),
+                milliseconds(Some(part.work)),
+                digits(part.parallel),
+            ]);
+        }
+    }
+    table
+}
+
+fn predictions(found: &[Found]) -> Table {
+    let mut table = Table::new(
+        "Predicted, not measured: mean response times with more cores (milliseconds), and how many times as fast as natively on the class Pi",
+        [
+            "program",
+            "cores",
+            "native on the Pi, measured",
+            "cautious",
+            "times as fast",
+            "bound",
+            "times as fast at most",
+            "published, up to",
+        ],
+    );
+    for one in found {
+        let Some(model) = &one.model else { continue };
+        for cores in MANY.into_iter().chain([f64::INFINITY]) {
+            let (cautious, bound) = (model.cautious(cores), model.bound(cores));
+            let times = |predicted: f64| ratio(one.native.map(|native| native / predicted));
+            table.push([
+                one.name().to_owned(),
+                if cores.is_finite() {
+                    cores.to_string()
+                } else {
+                    "without end".to_owned()
+                },
+                milliseconds(one.native),
+                milliseconds(Some(cautious)),
+                times(cautious),
+                milliseconds(Some(bound)),
+                times(bound),
+                ratio(Some(PUBLISHED)),
+            ]);
+        }
+    }
+    table
+}
+
+fn findings(section: &mut Section, one: &Found) {
+    let (name, subject) = (one.name(), &one.study.subject);
+    let Some(model) = &one.model else { return };
+    let pairs = one.held_back();
+    let relative: Vec<(f64, f64)> = pairs
+        .iter()
+        .map(|(predicted, measured)| (predicted / measured, 1.0))
+        .collect();
+    if let Some(error) = root_mean_square_error(&relative) {
+        let worst = relative.iter().map(|pair| (pair.0 - 1.0).abs());
+        section.findings.push(format!(
+            "{name}: at {} the model's error is {:.1} % (root mean square), at most {:.1} %.",
+            match pairs.len() {
+                1 => "the limit that was held back".to_owned(),
+                many => format!("the {many} limits that were held back"),
+            },
+            100.0 * error,
+            100.0 * worst.fold(0.0, f64::max)
+        ));
+    }
+    let computation = |cores: f64| {
+        let of = one.points.iter().find(|point| point.0 == cores);
+        of.map(|point| point.1[1])
+    };
+    if let Some((alone, most)) = computation(1.0).zip(computation(model.most)) {
+        if model.most > 1.0 {
+            let threads = match subject.threads {
+                1 => "one thread".to_owned(),
+                many => format!("{many} threads"),
+            };
+            section.findings.push(format!(
+                "{name}: with {} cores instead of one it computes {:.2} times as fast with {threads}, so {}.",
+                digits(model.most),
+                alone / most,
+                if model.has_end() {
+                    format!("more than {} cores are not expected to give anything", digits(model.parts[1].parallel))
+                } else {
+                    "no end of what cores give was seen; where it is, was not measured".to_owned()
+                }
+            ));
+        }
+    }
+    let Some(native) = one.native else { return };
+    let (cautious, bound) = (model.cautious(32.0), model.bound(f64::INFINITY));
+    let reached = if native / cautious >= PUBLISHED {
+        "which reaches the published factor"
+    } else if native / bound >= PUBLISHED {
+        "between which the published factor lies: this machine cannot tell"
+    } else {
+        "below the published factor: what is left is transport and what is not divided"
+    };
+    section.findings.push(format!(
+        "{name}: with 32 cores it would answer {:.1} times as fast as on the class Pi by the cautious prediction, and with cores without end at most {:.1} times, {reached}.",
+        native / cautious,
+        native / bound
+    ));
+}
+
+fn missing(section: &mut Section, one: &Found) {
+    let again = "run make eval again: what was measured stays";
+    let mut lacks = |what: String, why: &str| {
+        section.missing.push(Missing::new(what, why, again));
+    };
+    if let Measured::Missing(why) = &one.study.native {
+        lacks(format!("{}, native", one.name()), why);
+    }
+    for (cores, measured) in &one.study.runs {
+        let what = format!("{}, {cores} cores", one.name());
+        match measured {
+            Measured::Missing(why) => lacks(what, why),
+            Measured::Done(run) if parts(&run.trace).is_none() => {
+                lacks(what, "the package told no parts of its time");
+            }
+            Measured::Done(_) => {}
+        }
+    }
+    if one.model.is_none() {
+        lacks(
+            format!("{}: the model", one.name()),
+            "fewer than three limits of those that it is fitted to were measured",
+        );
+    }
+}
+
+/// Points that were fitted, points that were held back, and the model between them.
+fn curve(one: &Found, model: &Model) -> Result<String> {
+    let of = |fitted: bool| {
+        let chosen = one.points.iter().filter(move |point| point.2 == fitted);
+        chosen.map(|point| (point.0, total(point.1))).collect()
+    };
+    let least = one
+        .points
+        .iter()
+        .map(|point| point.0)
+        .fold(model.most, f64::min);
+    let steps = (0..=300).map(|step| least + (model.most - least) * f64::from(step) / 300.0);
+    let series = [
+        Series::new("fitted", of(true)),
+        Series::new("held back", of(false)),
+        Series::new(
+            "model",
+            steps.map(|cores| (cores, model.cautious(cores))).collect(),
+        ),
+    ];
+    plots::points(
+        one.name(),
+        "cores of the servant",
+        "mean response time, s",
+        &series,
+        true,
+    )
+}
+
+fn factors(found: &[Found]) -> Vec<Series> {
+    let mut series = Vec::new();
+    for one in found {
+        let Some((model, native)) = one.model.zip(one.native) else {
+            continue;
+        };
+        let over = |predict: fn(&Model, f64) -> f64| {
+            let cores = (0..=20).map(|step| 32f64.powf(f64::from(step) / 20.0));
+            cores
+                .map(|cores| (cores, native / predict(&model, cores)))
+                .collect()
+        };
+        series.push(Series::new(
+            format!("{}: cautious", one.name()),
+            over(Model::cautious),
+        ));
+        if !model.has_end() {
+            series.push(Series::new(
+                format!("{}: bound", one.name()),
+                over(Model::bound),
+            ));
+        }
+    }
+    if !series.is_empty() {
+        series.push(Series::new(
+            "published, up to",
+            vec![(1.0, PUBLISHED), (32.0, PUBLISHED)],
+        ));
+    }
+    series
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiments::cores::{Reading, SUBJECTS};
+    use crate::place::Cost;
+    use crate::trace::{Phases, Request, Trace};
+
+    fn trace(computation: f64) -> Trace {
+        Trace {
+            requests: vec![Request {
+                response: Some(computation + 0.05),
+                phases: Some(Phases {
+                    computation,
+                    ..Phases::default()
+                }),
+                ..Request::default()
+            }],
+            ..Trace::default()
+        }
+    }
+
+    /// A tenth of a core second, divided among the cores up to `parallel`; 50 ms of transport; natively 450 ms.
+    fn study(parallel: f64) -> Study {
+        let subject = SUBJECTS[2];
+        let run = |cores: &f64| {
+            let reading = Reading {
+                enforced: *cores,
+                trace: trace(0.1 / cores.min(parallel)),
+                cost: Cost::default(),
+            };
+            (*cores, Measured::Done(reading))
+        };
+        Study {
+            subject,
+            native: Measured::Done(trace(0.4)),
+            runs: [subject.fitted, subject.held_back]
+                .concat()
+                .iter()
+                .map(run)
+                .collect(),
+        }
+    }
+
+    #[test]
+    fn the_report_has_errors_and_factors_beside_the_published_one() {
+        let section = section(&[study(8.0)]).expect("it is drawn");
+        assert!(section.missing.is_empty(), "{:?}", section.missing);
+        assert!(
+            section.findings[0].contains("3 limits that were held back the model's error is 0.0 %"),
+            "{:?}",
+            section.findings
+        );
+        assert!(section.findings[1].contains("1.75 times as fast with 2 threads"));
+        let four = &section.tables[2].rows[0];
+        // 450 ms by 50 + 100 / 1.75, and by 50 + 100 / 4.
+        assert_eq!(four[1..], ["4", "450", "107", "4.2", "75.0", "6.0", "25.0"]);
+        let last = section.tables[2].rows.last().expect("rows");
+        assert_eq!(last[5..], ["50.0", "9.0", "25.0"]);
+        assert_eq!(section.figures.len(), 2);
+    }
+
+    #[test]
+    fn a_program_of_one_thread_gains_nothing() {
+        let section = section(&[study(1.0)]).expect("it is drawn");
+        assert!(
+            section.findings[1].contains("more than 1.00 cores are not expected"),
+            "{:?}",
+            section.findings
+        );
+        assert_eq!(section.tables[2].rows[0][4], section.tables[2].rows[3][6]);
+    }
+
+    #[test]
+    fn what_was_not_measured_is_named() {
+        let mut study = study(8.0);
+        for (_, measured) in study.runs.iter_mut().take(2) {
+            *measured = Measured::Missing("no cgroups".to_owned());
+        }
+        study.native = Measured::Missing("no cgroups".to_owned());
+        let section = section(&[study]).expect("it is drawn");
+        let missing: Vec<&str> = section
+            .missing
+            .iter()
+            .map(|one| one.what.as_str())
+            .collect();
+        assert_eq!(missing.len(), 4, "{missing:?}");
+        assert!(section.tables[2].rows.is_empty());
+    }
+}

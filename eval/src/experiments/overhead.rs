@@ -1,0 +1,358 @@
+//! Experiment 11: what portal and link add to raw TCPROS, and how servants start beside runtimes and a container engine of this distribution. The
+//! parts of the project's benchmarks that measure it are run.
+
+use anyhow::Result;
+
+use crate::cells::{Cells, Measured};
+use crate::plots::{self, Bar};
+use crate::section::{Missing, Section, Table};
+use crate::words::{digits, ratio};
+
+use super::benches::{self, Written};
+
+/// What the publication says of starting a servant: more than so many milliseconds.
+const PUBLISHED: f64 = 5000.0;
+/// What must be installed, or be there, to be measured beside ours; no run lacks anything where it is not.
+const SUITE: &str = "rosbridge_suite";
+
+/// What the benchmarks wrote.
+pub struct Runs {
+    /// `bench-servant starts`
+    starts: Measured<Written>,
+    /// `bench-portal`, trips alone
+    portal: Measured<Written>,
+    /// `bench-link strings`
+    link: Measured<Written>,
+}
+
+/// Runs what is needed of the benchmarks, unless that was done before.
+pub fn measure(cells: &Cells) -> Result<Runs> {
+    Ok(Runs {
+        starts: benches::part(cells, "servant", &["starts"])?,
+        portal: benches::part(cells, "portal", &["String there and back"])?,
+        link: benches::part(cells, "link", &["strings"])?,
+    })
+}
+
+/// What the report says.
+pub fn section(runs: &Runs) -> Result<Section> {
+    let mut section = Section::new(11, "overhead", "What the system itself adds");
+    section.published = "Starting a servant took over 5 s in the publication. It has no figure of what its portal adds to a message's way."
+        .to_owned();
+    section.differs = [
+        "Start times: cloudroid, libcontainer called from a bare program, and what Debian has (crun, runc, podman) start containers of the same root file system with the same limits, in turns in the same run; the peers run /bin/sleep, podman adds a layer that can be written, none has a network. What the publication timed is not said in parts; its number stands beside the time until a robot's node is registered and bridged.",
+        "crun refuses a host that has both versions of cgroups. There, all peers are given a mount namespace in which version 2 is covered.",
+        "Round trips: one String at a time to a roscpp node in a servant and back, on loopback; the best of the turns' medians. The client of raw TCPROS has its connections inside the servant's network namespace. The link is measured in a run of its own, from a publisher of the robot's ROS through its stub; its client of the portal writes and reads JSON itself, the other one sends prepared bytes.",
+    ]
+    .map(str::to_owned)
+    .to_vec();
+    starts(&mut section, &runs.starts)?;
+    trips(&mut section, &runs.portal, &runs.link);
+    Ok(section)
+}
+
+/// What a benchmark wrote, or why not.
+fn needed<'a>(
+    section: &mut Section,
+    what: &str,
+    measured: &'a Measured<Written>,
+) -> Option<&'a Written> {
+    let next = "make eval again: what was measured stays";
+    match measured {
+        Measured::Done(written) => {
+            for one in written.left_out.iter().filter(|one| one.what != SUITE) {
+                section.missing.push(Missing::new(
+                    &one.what,
+                    &one.why,
+                    "scripts/deps eval installs it",
+                ));
+            }
+            section.findings.extend(written.unmet());
+            Some(written)
+        }
+        Measured::Missing(why) => {
+            section.missing.push(Missing::new(what, why, next));
+            None
+        }
+    }
+}
+
+fn value(written: &Written, figure: &str) -> Option<f64> {
+    let mut all = written.figures.iter();
+    all.find(|one| one.figure == figure)?.value
+}
+
+/// What a figure was measured beside, with its number.
+fn beside<'a>(written: &'a Written, figure: &'a str) -> impl Iterator<Item = (&'a str, f64)> + 'a {
+    let all = written
+        .figures
+        .iter()
+        .filter(move |one| one.figure == figure);
+    all.filter_map(|one| Some((one.peer.as_deref()?, one.floor?)))
+}
+
+/// How the benchmark calls the time until a robot is served, and what it is here.
+const SERVED: [(&str, &str); 3] = [
+    (
+        "robot connects → node registered, bridged",
+        "cloudroid, a container made ahead",
+    ),
+    (
+        "robot connects → node registered, bridged, without a container made ahead",
+        "cloudroid, no container made ahead",
+    ),
+    (
+        "robot connects → first answer, nodes running already",
+        "cloudroid, nodes running already",
+    ),
+];
+const NODE: &str = "node alone: exec → registered";
+const RUNNING: &str = "create → running";
+
+fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
+    let Some(written) = needed(section, "start times", measured) else {
+        return Ok(());
+    };
+    let mut table = Table::new(
+        "Start times, medians (milliseconds)",
+        [
+            "from, to",
+            "what starts",
+            "time",
+            "published",
+            "times as fast",
+        ],
+    );
+    let mut bars = Vec::new();
+    let mut bar = |group: &str, name: &str, value| {
+        bars.push(Bar {
+            group: group.to_owned(),
+            name: name.to_owned(),
+            value,
+            spread: None,
+        });
+    };
+    let served = "a robot connects, its node is registered and bridged";
+    for (figure, name) in SERVED {
+        let Some(time) = value(written, figure) else {
+            lacks(section, figure);
+            continue;
+        };
+        let faster = format!("more than {}", ratio(Some(PUBLISHED / time)));
+        table.push([served, name, &digits(time), "> 5000", &faster]);
+        bar("robot served", name, time);
+    }
+    if let Some(time) = value(written, NODE) {
+        let floor = "the node alone in a chroot, the floor";
+        table.push(["exec, registered", floor, &digits(time), "", ""]);
+        bar("robot served", floor, time);
+    }
+    bar("robot served", "published, at least", PUBLISHED);
+    let ours = "cloudroid's engine: shim, Master, init, limits read back";
+    match value(written, RUNNING) {
+        Some(time) => {
+            table.push(["create, container runs", ours, &digits(time), "", ""]);
+            bar("container runs", "cloudroid's engine", time);
+            for (peer, other) in beside(written, RUNNING) {
+                table.push(["create, container runs", peer, &digits(other), "", ""]);
+                bar("container runs", peer, other);
+                section.findings.push(compared(peer, time, other));
+            }
+        }
+        None => lacks(section, RUNNING),
+    }
+    section.tables.push(table);
+    section.drawing(
+        "overhead-starts",
+        "Start times",
+        plots::bars("start times", "ms", &bars, true)?,
+    );
+    Ok(())
+}
+
+fn lacks(section: &mut Section, figure: &str) {
+    section.missing.push(Missing::new(
+        figure,
+        "the benchmark did not write it",
+        "look at what it printed",
+    ));
+}
+
+fn compared(peer: &str, ours: f64, theirs: f64) -> String {
+    let times = ratio(Some(ours / theirs));
+    let (ours_told, theirs_told) = (digits(ours), digits(theirs));
+    let so = format!(
+        "cloudroid's engine has a container running in {ours_told} ms, {peer} in {theirs_told} ms ({times} times as long"
+    );
+    if ours > theirs {
+        format!(
+            "{so}: it also starts a shim with a ROS Master and an init, and reads the limits back)."
+        )
+    } else {
+        format!("{so}).")
+    }
+}
+
+const TRIP: &str = "String there and back";
+const LINK: &str = "String there and back over the link: p50";
+const DIRECT: &str = "TCPROS, no hop between";
+
+fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Written>) {
+    let portal = needed(section, "round trips by the portal", portal);
+    let link = needed(section, "round trips by the link", link);
+    let [p50, p99] = ["p50", "p99"].map(|quantile| format!("{TRIP}, {quantile}"));
+    let none = Written::default();
+    let written = portal.unwrap_or(&none);
+    let other = |figure: &str, way: &str| {
+        let mut all = beside(written, figure);
+        all.find(|(peer, _)| *peer == way).map(|(_, time)| time)
+    };
+    let direct = other(&p50, DIRECT);
+    let mut table = Table::new(
+        "A String there and back (microseconds)",
+        [
+            "way",
+            "median",
+            "99 %",
+            "added to raw TCPROS",
+            "times raw TCPROS",
+        ],
+    );
+    let mut row = |way: &str, median: Option<f64>, late: Option<f64>| {
+        let told = |time: Option<f64>| time.map_or_else(|| "–".to_owned(), digits);
+        let both = median.zip(direct);
+        table.push([
+            way.to_owned(),
+            told(median),
+            told(late),
+            told(both.map(|(median, direct)| median - direct)),
+            ratio(both.map(|(median, direct)| median / direct)),
+        ]);
+    };
+    if portal.is_some() {
+        row("raw TCPROS", direct, other(&p99, DIRECT));
+        for (way, name) in [
+            ("byte relay", "a process that moves bytes, the floor"),
+            (
+                "serde_json::Value",
+                "a process that converts by trees of values",
+            ),
+        ] {
+            row(name, other(&p50, way), other(&p99, way));
+        }
+        row("portal, JSON", value(written, &p50), value(written, &p99));
+        row(
+            "rosbridge_suite, JSON",
+            other(&p50, SUITE),
+            other(&p99, SUITE),
+        );
+    }
+    if let Some(link) = link {
+        row("stub and link", value(link, LINK), None);
+        for (peer, time) in beside(link, LINK) {
+            row(&format!("{peer}, in the link's run"), Some(time), None);
+        }
+    }
+    section.tables.push(table);
+    for one in written.left_out.iter().filter(|one| one.what == SUITE) {
+        section
+            .differs
+            .push(format!("{SUITE} was not measured: {}.", one.why));
+    }
+    if let Some((ours, direct)) = value(written, &p50).zip(direct) {
+        let relay = other(&p50, "byte relay").map_or_else(String::new, |relay| {
+            format!(
+                "; a process that only moves the bytes adds {} µs",
+                digits(relay - direct)
+            )
+        });
+        section.findings.push(format!(
+            "The portal adds {} µs to the {} µs of raw TCPROS{relay}.",
+            digits(ours - direct),
+            digits(direct)
+        ));
+    }
+    if let Some((ours, direct)) = link.and_then(|link| value(link, LINK)).zip(direct) {
+        section.findings.push(format!(
+            "Stub and link add {} µs: two connections more, from the robot's node to the stub and from there to the server.",
+            digits(ours - direct)
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bench_report::Report;
+
+    fn written(report: &Report) -> Measured<Written> {
+        let text = serde_json::to_string(report).expect("JSON");
+        Measured::Done(serde_json::from_str(&text).expect("what a benchmark writes"))
+    }
+
+    fn runs() -> Runs {
+        let mut starts = Report::new("servant");
+        for (figure, time) in SERVED.map(|one| one.0).into_iter().zip([10.0, 40.0, 2.0]) {
+            starts.figure(figure, "ms", time);
+        }
+        starts.figure(NODE, "ms", 8.0);
+        for (peer, time) in [("crun", 20.0), ("podman", 100.0)] {
+            starts.figure(RUNNING, "ms", 25.0).beside(peer, time);
+        }
+        let mut portal = Report::new("portal");
+        for (quantile, time) in [("p50", 60.0), ("p99", 90.0)] {
+            let name = format!("{TRIP}, {quantile}");
+            portal.figure(&name, "µs", time).beside("byte relay", 50.0);
+            portal.figure(&name, "µs", time).beside(DIRECT, 40.0);
+        }
+        portal.left_out(SUITE, "it is not packaged");
+        let mut link = Report::new("link");
+        let portals = "a client of the portal, JSON";
+        link.figure(LINK, "µs", 80.0).beside(portals, 64.0);
+        Runs {
+            starts: written(&starts),
+            portal: written(&portal),
+            link: written(&link),
+        }
+    }
+
+    #[test]
+    fn start_times_stand_beside_the_published_one_and_the_peers() {
+        let section = section(&runs()).expect("it is drawn");
+        assert!(section.missing.is_empty(), "{:?}", section.missing);
+        let rows = &section.tables[0].rows;
+        assert_eq!(rows[0][2..], ["10.0", "> 5000", "more than 500.0"]);
+        assert_eq!(rows[6][1..3], ["podman", "100"]);
+        assert!(section.findings[0].contains("crun in 20.0 ms (1.2 times as long: it also"));
+        assert!(section.findings[1].contains("podman in 100 ms (0.25 times as long)."));
+    }
+
+    #[test]
+    fn what_is_added_is_the_difference_to_raw_tcpros() {
+        let section = section(&runs()).expect("it is drawn");
+        let rows = &section.tables[1].rows;
+        assert_eq!(rows[0], ["raw TCPROS", "40.0", "40.0", "0.00", "1.0"]);
+        assert_eq!(rows[3], ["portal, JSON", "60.0", "90.0", "20.0", "1.5"]);
+        assert_eq!(rows[4][1..], ["–", "–", "–", "–"]);
+        assert_eq!(rows[5], ["stub and link", "80.0", "–", "40.0", "2.0"]);
+        let why = section.differs.last().expect("some");
+        assert_eq!(why, "rosbridge_suite was not measured: it is not packaged.");
+    }
+
+    #[test]
+    fn what_did_not_run_is_named() {
+        let mut runs = runs();
+        runs.starts = Measured::Missing("it is not built".to_owned());
+        runs.portal = written(&Report::new("portal"));
+        let mut link = Report::new("link");
+        link.left_out("a part", "no time");
+        runs.link = written(&link);
+        let section = section(&runs).expect("it is drawn");
+        let missing: Vec<&str> = section
+            .missing
+            .iter()
+            .map(|one| one.what.as_str())
+            .collect();
+        assert_eq!(missing, ["start times", "a part"]);
+    }
+}
