@@ -1,6 +1,7 @@
 //! A part of experiment 2: packages in the cloud with several limits of cores, a model of their response times that is fitted to some of these,
 //! its error at the others, and what it says of clouds with more cores than this machine has.
 
+mod drawn;
 mod model;
 mod told;
 
@@ -194,7 +195,7 @@ impl<'a> Found<'a> {
         Self {
             study,
             points,
-            model: Model::fit(&fitted),
+            model: Model::fit(&fitted, study.subject.threads),
             native: native.map(total),
         }
     }

@@ -52,11 +52,13 @@ pub struct Model {
     pub parts: [RrtModel; 4],
     /// The greatest number of cores that it was fitted to.
     pub most: f64,
+    /// Threads that the program computed with.
+    pub threads: usize,
 }
 
 impl Model {
-    /// Fitted to (cores, parts) of runs. None unless there are three runs with at least two numbers of cores.
-    pub fn fit(runs: &[(f64, Parts)]) -> Option<Self> {
+    /// Fitted to (cores, parts) of runs of a program with so many threads. None unless there are three runs with at least two numbers of cores.
+    pub fn fit(runs: &[(f64, Parts)], threads: usize) -> Option<Self> {
         let of = |index: usize| {
             let points: Vec<Point> = runs
                 .iter()
@@ -68,6 +70,7 @@ impl Model {
         Some(Self {
             parts: [of(0)?, of(1)?, of(2)?, of(3)?],
             most,
+            threads,
         })
     }
 
@@ -79,11 +82,12 @@ impl Model {
             .sum()
     }
 
-    /// The same if the computation's work can be divided among all cores, however many, as it was up to the greatest number that was measured:
-    /// less cannot come out by this model. Where the measured points showed an end of that, it is the cautious one.
+    /// The same if the computation's work can be divided among all cores, however many, as among the first ones: less cannot come out by this
+    /// model. Of a program with one thread it is the cautious one. Where points showed an end of what cores give, it may have been the
+    /// machine's, so the bound goes beyond it.
     pub fn bound(&self, cores: f64) -> f64 {
         let computation = self.parts[COMPUTATION];
-        if self.has_end() || cores <= self.most {
+        if self.threads < 2 || cores <= computation.parallel {
             return self.cautious(cores);
         }
         self.cautious(cores) - computation.work / computation.parallel + computation.work / cores
@@ -151,7 +155,7 @@ mod tests {
 
     #[test]
     fn work_that_was_shared_may_go_on_to_be() {
-        let model = Model::fit(&runs(8.0)).expect("four limits");
+        let model = Model::fit(&runs(8.0), 2).expect("four limits");
         assert!(!model.has_end());
         near(model.cautious(0.8), 0.051 + 2.5);
         // Two cores were measured, so four give no less.
@@ -163,14 +167,23 @@ mod tests {
 
     #[test]
     fn one_thread_needs_one_core() {
-        let model = Model::fit(&runs(1.0)).expect("four limits");
+        let model = Model::fit(&runs(1.0), 1).expect("four limits");
         assert!(model.has_end());
         near(model.cautious(4.0), 0.051 + 2.0);
         near(model.bound(32.0), 0.051 + 2.0);
     }
 
+    /// Two threads that gained nothing above one core: it may have been the machine's end.
+    #[test]
+    fn the_bound_goes_beyond_an_end_that_was_seen() {
+        let model = Model::fit(&runs(1.0), 2).expect("four limits");
+        assert!(model.has_end());
+        near(model.cautious(4.0), 0.051 + 2.0);
+        near(model.bound(4.0), 0.051 + 0.5);
+    }
+
     #[test]
     fn two_limits_are_too_few() {
-        assert_eq!(Model::fit(&runs(1.0)[..2]), None);
+        assert_eq!(Model::fit(&runs(1.0)[..2], 1), None);
     }
 }

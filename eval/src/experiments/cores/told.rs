@@ -3,18 +3,19 @@
 use anyhow::Result;
 
 use crate::cells::Measured;
-use crate::plots::{self, Series};
+use crate::plots;
 use crate::section::{Missing, Section, Table};
 use crate::statistics::root_mean_square_error;
 use crate::words::{digits, milliseconds, ratio};
 
+use super::drawn::{curve, factors};
 use super::model::{Model, NAMES, bytes, parts};
 use super::{Found, Study, total};
 
 /// Cores for which response times are predicted.
 const MANY: [f64; 4] = [4.0, 8.0, 16.0, 32.0];
 /// The publication's greatest factor (Fig. 5).
-const PUBLISHED: f64 = 25.0;
+pub(super) const PUBLISHED: f64 = 25.0;
 
 /// What the report says.
 pub fn section(studies: &[Study]) -> Result<Section> {
@@ -63,7 +64,7 @@ fn differs() -> Vec<String> {
         ),
         "Each part of the response time (acquisition, computation and rendering as the package tells them; the rest is transport and waiting) has a model of its own: overhead + work / min(cores, parallel), fitted to means of whole runs.".to_owned(),
         "A limit of a fraction of a core is not a slow core: the kernel lets the program run at full speed for a part of each tenth of a second and stops it for the rest (CFS bandwidth control). One request may pass without being stopped, the next one waits; only means follow the limit. The same holds for limits between one core and two, and what was measured there says nothing of caches, memory bandwidth or sockets of a machine with many cores.".to_owned(),
-        "Two predictions are given. The cautious one: more cores than were measured give nothing more. The bound: all work of the computation is divided among all cores as it was up to the greatest measured limit, without an end; the package would have to be started with that many threads.".to_owned(),
+        "Two predictions are given. The cautious one: more cores than were measured give nothing more. The bound, for programs with more than one thread: all work of the computation is divided among all cores as among the first ones, without an end; the package would have to be started with that many threads.".to_owned(),
         "The model cannot know cores of another speed (the cloud's core is four times the Pi class's quarter here, because it is the same core), a GPU, what several robots do to each other, or another network than the LAN that was measured.".to_owned(),
     ]
 }
@@ -209,11 +210,7 @@ fn findings(section: &mut Section, one: &Found) {
                 "{name}: with {} cores instead of one it computes {:.2} times as fast with {threads}, so {}.",
                 digits(model.most),
                 alone / most,
-                if model.has_end() {
-                    format!("more than {} cores are not expected to give anything", digits(model.parts[1].parallel))
-                } else {
-                    "no end of what cores give was seen; where it is, was not measured".to_owned()
-                }
+                ends(model)
             ));
         }
     }
@@ -231,6 +228,20 @@ fn findings(section: &mut Section, one: &Found) {
         native / cautious,
         native / bound
     ));
+}
+
+/// What the points say of how many cores the program can use.
+fn ends(model: &Model) -> String {
+    let end = digits(model.parts[1].parallel);
+    match (model.has_end(), model.threads) {
+        (false, _) => {
+            "no end of what cores give was seen; where it is, was not measured".to_owned()
+        }
+        (true, 1) => format!("more than {end} cores are not expected to give anything"),
+        (true, _) => format!(
+            "above {end} cores nothing was gained: whether the program ends there or this machine, whose cores robot and daemon need as well, was not measured"
+        ),
+    }
 }
 
 fn missing(section: &mut Section, one: &Found) {
@@ -259,71 +270,10 @@ fn missing(section: &mut Section, one: &Found) {
     }
 }
 
-/// Points that were fitted, points that were held back, and the model between them.
-fn curve(one: &Found, model: &Model) -> Result<String> {
-    let of = |fitted: bool| {
-        let chosen = one.points.iter().filter(move |point| point.2 == fitted);
-        chosen.map(|point| (point.0, total(point.1))).collect()
-    };
-    let least = one
-        .points
-        .iter()
-        .map(|point| point.0)
-        .fold(model.most, f64::min);
-    let steps = (0..=300).map(|step| least + (model.most - least) * f64::from(step) / 300.0);
-    let series = [
-        Series::new("fitted", of(true)),
-        Series::new("held back", of(false)),
-        Series::new(
-            "model",
-            steps.map(|cores| (cores, model.cautious(cores))).collect(),
-        ),
-    ];
-    plots::points(
-        one.name(),
-        "cores of the servant",
-        "mean response time, s",
-        &series,
-        true,
-    )
-}
-
-fn factors(found: &[Found]) -> Vec<Series> {
-    let mut series = Vec::new();
-    for one in found {
-        let Some((model, native)) = one.model.zip(one.native) else {
-            continue;
-        };
-        let over = |predict: fn(&Model, f64) -> f64| {
-            let cores = (0..=20).map(|step| 32f64.powf(f64::from(step) / 20.0));
-            cores
-                .map(|cores| (cores, native / predict(&model, cores)))
-                .collect()
-        };
-        series.push(Series::new(
-            format!("{}: cautious", one.name()),
-            over(Model::cautious),
-        ));
-        if !model.has_end() {
-            series.push(Series::new(
-                format!("{}: bound", one.name()),
-                over(Model::bound),
-            ));
-        }
-    }
-    if !series.is_empty() {
-        series.push(Series::new(
-            "published, up to",
-            vec![(1.0, PUBLISHED), (32.0, PUBLISHED)],
-        ));
-    }
-    series
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::experiments::cores::{Reading, SUBJECTS};
+    use crate::experiments::cores::{Reading, SUBJECTS, Subject};
     use crate::place::Cost;
     use crate::trace::{Phases, Request, Trace};
 
@@ -342,8 +292,7 @@ mod tests {
     }
 
     /// A tenth of a core second, divided among the cores up to `parallel`; 50 ms of transport; natively 450 ms.
-    fn study(parallel: f64) -> Study {
-        let subject = SUBJECTS[2];
+    fn study(subject: Subject, parallel: f64) -> Study {
         let run = |cores: &f64| {
             let reading = Reading {
                 enforced: *cores,
@@ -365,7 +314,7 @@ mod tests {
 
     #[test]
     fn the_report_has_errors_and_factors_beside_the_published_one() {
-        let section = section(&[study(8.0)]).expect("it is drawn");
+        let section = section(&[study(SUBJECTS[2], 8.0)]).expect("it is drawn");
         assert!(section.missing.is_empty(), "{:?}", section.missing);
         assert!(
             section.findings[0].contains("3 limits that were held back the model's error is 0.0 %"),
@@ -383,7 +332,7 @@ mod tests {
 
     #[test]
     fn a_program_of_one_thread_gains_nothing() {
-        let section = section(&[study(1.0)]).expect("it is drawn");
+        let section = section(&[study(SUBJECTS[1], 1.0)]).expect("it is drawn");
         assert!(
             section.findings[1].contains("more than 1.00 cores are not expected"),
             "{:?}",
@@ -394,7 +343,7 @@ mod tests {
 
     #[test]
     fn what_was_not_measured_is_named() {
-        let mut study = study(8.0);
+        let mut study = study(SUBJECTS[2], 8.0);
         for (_, measured) in study.runs.iter_mut().take(2) {
             *measured = Measured::Missing("no cgroups".to_owned());
         }

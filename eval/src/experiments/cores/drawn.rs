@@ -1,0 +1,71 @@
+//! Plots of programs with several limits of cores.
+
+use anyhow::Result;
+
+use crate::plots::{self, Series};
+
+use super::model::Model;
+use super::told::PUBLISHED;
+use super::{Found, total};
+
+/// Points that were fitted, points that were held back, and the model between them.
+pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
+    let of = |fitted: bool| {
+        let chosen = one.points.iter().filter(move |point| point.2 == fitted);
+        chosen.map(|point| (point.0, total(point.1))).collect()
+    };
+    let least = one
+        .points
+        .iter()
+        .map(|point| point.0)
+        .fold(model.most, f64::min);
+    let steps = (0..=300).map(|step| least + (model.most - least) * f64::from(step) / 300.0);
+    let series = [
+        Series::new("fitted", of(true)),
+        Series::new("held back", of(false)),
+        Series::new(
+            "model",
+            steps.map(|cores| (cores, model.cautious(cores))).collect(),
+        ),
+    ];
+    plots::points(
+        one.name(),
+        "cores of the servant",
+        "mean response time, s",
+        &series,
+        true,
+    )
+}
+
+/// Times as fast as natively on the class Pi, by cores: predicted, and what the publication reached.
+pub(super) fn factors(found: &[Found]) -> Vec<Series> {
+    let mut series = Vec::new();
+    for one in found {
+        let Some((model, native)) = one.model.zip(one.native) else {
+            continue;
+        };
+        let over = |predict: fn(&Model, f64) -> f64| {
+            let cores = (0..=20).map(|step| 32f64.powf(f64::from(step) / 20.0));
+            cores
+                .map(|cores| (cores, native / predict(&model, cores)))
+                .collect()
+        };
+        series.push(Series::new(
+            format!("{}: cautious", one.name()),
+            over(Model::cautious),
+        ));
+        if model.threads > 1 {
+            series.push(Series::new(
+                format!("{}: bound", one.name()),
+                over(Model::bound),
+            ));
+        }
+    }
+    if !series.is_empty() {
+        series.push(Series::new(
+            "published, up to",
+            vec![(1.0, PUBLISHED), (32.0, PUBLISHED)],
+        ));
+    }
+    series
+}
