@@ -92,7 +92,7 @@ endef
 
 .PHONY: build-dev
 build-dev: init web
-	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --test stories
+	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --bin eval --test stories
 	$(call beside,debug)
 
 .PHONY: build-demo
@@ -107,8 +107,8 @@ demo: demo-deps build-demo ## push Debian's people_detect and find people in rea
 	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/demo" demo/demo
 
 .PHONY: test
-test: ## format, lints, unit tests, stories, stories in a virtual machine; says how long each took
-	@scripts/parts test-deps lint unit stories test-vm
+test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took
+	@scripts/parts test-deps lint unit stories test-eval test-vm
 
 .PHONY: lint
 lint:
@@ -167,15 +167,34 @@ bench: test-deps build ## every measurement with its peer in the same run; ONLY=
 	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
 
 # What the evaluation runs beside its own experiments.
-EVAL_BENCHES := failover choreographer servant portal
+EVAL_BENCHES := failover choreographer servant portal link
 
 .PHONY: eval
+ifneq ($(QUICK),)
+eval: eval-quick
+else
 eval: test-deps build ## the published experiments on this machine, with a report; QUICK=1: few requests; ONLY=2,7; FRESH=1: all anew (as root)
 	@scripts/deps build run test eval
 	@cargo build --locked --release -p eval
-	@[ -n "$(QUICK)" ] || cargo build --locked --release $(EVAL_BENCHES:%=-p bench-%)
-	@[ -n "$(QUICK)" ] || cargo build --locked --release -p bench-codecs --features video
-	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/release/eval" $(if $(QUICK),--quick) $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))
+	@cargo build --locked --release $(EVAL_BENCHES:%=-p bench-%)
+	@cargo build --locked --release -p bench-codecs --features video
+	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/release/eval" $(EVAL_WORDS)
+endif
+
+EVAL_WORDS = $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))
+
+# A part of make test, with the programs that its other parts use: it shows that everything works, and its figures are of programs that
+# are not optimised.
+.PHONY: eval-quick
+eval-quick: test-deps build-dev
+	@scripts/deps build run test eval
+	@echo "== quick evaluation"
+	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/debug" "$(CARGO_TARGET_DIR)/debug/eval" --quick $(EVAL_WORDS)
+
+# What was measured before a change says nothing of it.
+.PHONY: test-eval
+test-eval:
+	@$(MAKE) eval-quick FRESH=1
 
 .PHONY: fuzz
 fuzz: ## a minute of fuzzing for every decoder; ONLY=name for one, FUZZ_SECONDS=n for another time
