@@ -71,6 +71,19 @@ pub fn points(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> 
     series::points(title, (x, y), series, log_y)
 }
 
+/// Curves such as a model's as lines, and what was measured as points.
+pub fn curves(
+    title: &str,
+    x: &str,
+    y: &str,
+    curves: &[Series],
+    points: &[Series],
+    log_y: bool,
+) -> Result<String> {
+    let series = [curves, points].concat();
+    series::curves(title, (x, y), &series, curves.len(), log_y)
+}
+
 /// Trajectories: lines, a metre of x as long as a metre of y.
 pub fn map(title: &str, x: &str, y: &str, series: &[Series]) -> Result<String> {
     series::map(title, (x, y), series)
@@ -215,6 +228,29 @@ mod tests {
         )
         .expect("it is drawn");
         assert!(count(&whole, "stroke=\"#0072B2\"") > count(&broken, "stroke=\"#0072B2\""));
+    }
+
+    /// A model's curve has no markers and is the first colour, what was measured has no line.
+    #[test]
+    fn curves_are_lines_and_measurements_are_points() {
+        let curve: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), f64::from(x * x))).collect();
+        let points = [Series::new("held back", vec![(3.0, 9.5), (20.0, 390.0)])];
+        let text = curves(
+            "t",
+            "x",
+            "y",
+            &[Series::new("model", curve)],
+            &points,
+            false,
+        )
+        .expect("it is drawn");
+        let same = lines("t", "x", "y", &points, false).expect("it is drawn");
+        assert!(
+            text.contains("model") && text.contains("held back"),
+            "{text}"
+        );
+        assert!(!text.contains("points=\"\"") && count(&text, "#E69F00") < count(&text, "#0072B2"));
+        assert!(count(&same, "<polyline") > 0, "{same}");
     }
 
     #[test]

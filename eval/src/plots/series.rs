@@ -22,6 +22,19 @@ const MAP_HEIGHT: (f64, f64) = (220.0, 640.0);
 enum Shape {
     Lines,
     Points,
+    /// So many lines, then points.
+    Curves(usize),
+}
+
+impl Shape {
+    /// Of a single series.
+    fn of(self, index: usize) -> Self {
+        match self {
+            Self::Curves(lines) if index < lines => Self::Lines,
+            Self::Curves(_) => Self::Points,
+            same => same,
+        }
+    }
 }
 
 /// Positions on both axes; none for what has no place.
@@ -45,6 +58,17 @@ pub(super) fn points(
     plain(title, names, series, log, Shape::Points)
 }
 
+/// The first `curves` series as lines, the others as points.
+pub(super) fn curves(
+    title: &str,
+    names: (&str, &str),
+    series: &[Series],
+    curves: usize,
+    log: bool,
+) -> Result<String> {
+    plain(title, names, series, log, Shape::Curves(curves))
+}
+
 fn plain(
     title: &str,
     names: (&str, &str),
@@ -63,11 +87,14 @@ fn plain(
         .iter()
         .map(|one| place(&one.points, &x, &y))
         .collect();
-    let sign = match shape {
-        Shape::Lines => Sign::Line,
-        Shape::Points => Sign::Point,
-    };
-    let head = Head::new(title, legend(series, sign), WIDTH);
+    let mut legend = legend(series, Sign::Line);
+    for entry in &mut legend {
+        entry.sign = match shape.of(entry.index) {
+            Shape::Points => Sign::Point,
+            _ => Sign::Line,
+        };
+    }
+    let head = Head::new(title, legend, WIDTH);
     document(&head, (WIDTH, HEIGHT), left_out(omitted), |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
         let chart = chart(area, rows, &Sides::of(&y), (&x, names.0), (&y, names.1))?;
@@ -206,8 +233,8 @@ fn draw(area: &Area, chart: &Chart, placed: &[Placed], shape: Shape) -> Result<(
             .iter()
             .map(|point| point.map(|at| chart.backend_coord(&at)))
             .collect();
-        match shape {
-            Shape::Lines => line(area, &pixels, index, placed.len())?,
+        match shape.of(index) {
+            Shape::Lines | Shape::Curves(_) => line(area, &pixels, index, placed.len())?,
             Shape::Points => {
                 let mut drawn = HashSet::new();
                 for at in pixels.into_iter().flatten() {
