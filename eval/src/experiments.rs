@@ -2,8 +2,11 @@
 
 pub mod benches;
 pub mod cores;
+pub mod crowd;
 pub mod map;
 pub mod memory;
+pub mod neighbours;
 pub mod outsourcing;
 pub mod overhead;
+pub mod scale;
 pub mod transparency;

@@ -11,7 +11,10 @@ use support::daemon::Setup;
 
 use eval::cells::Cells;
 use eval::examples::Workshop;
-use eval::experiments::{benches, cores, map, memory, outsourcing, overhead, transparency};
+use eval::experiments::crowd::Yard;
+use eval::experiments::{
+    benches, cores, map, memory, neighbours, outsourcing, overhead, scale, transparency,
+};
 use eval::section::Section;
 use eval::{report, robot};
 
@@ -117,6 +120,18 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
             workshop,
             most.map(|most| most * 3),
         )?)?);
+    }
+    if [9, 10].into_iter().any(wanted) {
+        let place = workshop.directory()?;
+        let mut yard = Yard::new(place.path());
+        if wanted(9) {
+            let runs = neighbours::measure(cells, &mut yard, arguments.quick)?;
+            sections.push(neighbours::section(&runs)?);
+        }
+        if wanted(10) {
+            let runs = scale::measure(cells, &mut yard, arguments.quick)?;
+            sections.push(scale::section(&runs)?);
+        }
     }
     if !arguments.quick {
         if wanted(11) {

@@ -29,7 +29,7 @@ impl Bench {
 }
 
 /// In the order of the publication's experiments.
-pub const ALL: [Bench; 4] = [
+pub const ALL: [Bench; 2] = [
     Bench {
         number: 6,
         name: "failover",
@@ -43,20 +43,6 @@ pub const ALL: [Bench; 4] = [
         title: "Bytes that codecs save",
         published: "Table I of the publication: video by libav saves 75.4 %, images by deflate 96.1 %, grid maps by zlib 99.9 %.",
         differs: "Pictures, depth images and maps of other sources; each codec beside the one that the publication used.",
-    },
-    Bench {
-        number: 9,
-        name: "choreographer",
-        title: "Robots beside each other",
-        published: "Robots have servants of their own in the publication, which are isolated from one another.",
-        differs: "A promised servant beside greedy neighbours; mixed SLAs with the controller on and off.",
-    },
-    Bench {
-        number: 10,
-        name: "servant",
-        title: "How servants start, and how many there can be",
-        published: "Starting a servant took over 5 s.",
-        differs: "Beside what this distribution has: bare containers by libcontainer, and runtimes of others where they are installed.",
     },
 ];
 

@@ -1,0 +1,407 @@
+//! What the report says of the points, and of the queue that is fitted to a part of them.
+
+use anyhow::Result;
+
+use super::{Plan, Point, Runs, THINK};
+use crate::cells::Measured;
+use crate::experiments::crowd::SHORT;
+use crate::plots::{self, Series};
+use crate::section::{Missing, Section, Table};
+use crate::statistics::{Node, Observed, mean, median, quantile};
+use crate::words::{digits, milliseconds, ratio};
+
+/// The mean response time that robots accept where nodes are counted, seconds.
+const T_MAX: f64 = 0.1;
+/// Numbers of robots for which nodes are counted.
+const MANY: [u64; 2] = [1_000, 100_000];
+/// How many times as long as alone the median is where the curve counts as bent.
+const BENT: f64 = 2.0;
+/// From this share on, a resource counts as used up.
+const FULL: f64 = 0.85;
+/// Part of a node's memory that servants may have, as the daemon's default.
+const MEMORY_PART: f64 = 0.9;
+const MEGA: f64 = 1e6;
+
+/// A point, with what it is for.
+struct Told<'a> {
+    plan: &'a Plan,
+    point: &'a Point,
+    /// The model was fitted without it.
+    held_back: bool,
+}
+
+impl Told<'_> {
+    fn robots(&self) -> f64 {
+        self.plan.robots as f64
+    }
+
+    fn mean(&self) -> Option<f64> {
+        mean(&self.point.times)
+    }
+
+    fn observed(&self) -> Option<Observed> {
+        Some(Observed {
+            robots: self.plan.robots as u64,
+            response: self.mean()?,
+            busy: self.point.used.requests() / self.plan.cores,
+        })
+    }
+
+    /// Memory of a robot, bytes: what the machine has less, or what the control groups say where that is more.
+    fn memory(&self) -> f64 {
+        self.point.taken.max(self.point.servants_memory) / self.robots()
+    }
+
+    fn milliseconds_each(&self, cores: f64) -> f64 {
+        cores * self.point.lasted / self.point.times.len() as f64 * 1e3
+    }
+
+    fn busy(&self) -> f64 {
+        self.point.used.machine / self.plan.cores
+    }
+}
+
+/// What the report says.
+pub fn section(runs: &Runs) -> Result<Section> {
+    let mut section = Section::new(10, "scale", "How many robots a node serves");
+    section.published = "Starting a servant took over 5 s.".to_owned();
+    section.differs = vec![
+        format!(
+            "Each robot is a connection of one process on the same machine, pauses for {:.0} ms on average after each answer, and has a \
+             servant of its own, of a node that computes for {} ms of a core at each call and needs little memory.",
+            THINK * 1e3,
+            SHORT.milliseconds
+        ),
+        "Every other point was held back from the model's fit; the others determine its two parameters.".to_owned(),
+    ];
+    let mut told = Vec::new();
+    for (index, (plan, measured)) in runs.0.iter().enumerate() {
+        match measured {
+            Measured::Done(point) => told.push(Told {
+                plan,
+                point,
+                held_back: index % 2 == 1,
+            }),
+            Measured::Missing(why) => section.missing.push(Missing::new(
+                format!("{} robots", plan.robots),
+                why,
+                "make eval ONLY=10 tries it again",
+            )),
+        }
+    }
+    if told.is_empty() {
+        return Ok(section);
+    }
+    let fitted = told.iter().filter(|one| !one.held_back);
+    let fitted: Option<Vec<Observed>> = fitted.map(Told::observed).collect();
+    let node = fitted.and_then(|all| Node::fit(&all, told[0].plan.cores, told[0].plan.think));
+    starts(&told, &mut section)?;
+    points(&told, node.as_ref(), &mut section);
+    costs(&told, &mut section)?;
+    bend(&told, node.as_ref(), &mut section);
+    match &node {
+        Some(node) => model(&told, node, &mut section)?,
+        None => section.missing.push(Missing::new(
+            "the queueing model",
+            "fewer than two of the points that determine it were measured",
+            "make eval ONLY=10",
+        )),
+    }
+    Ok(section)
+}
+
+fn starts(told: &[Told], section: &mut Section) -> Result<()> {
+    let all: Vec<(usize, f64)> = told
+        .iter()
+        .flat_map(|one| one.point.starts.iter().copied())
+        .collect();
+    let times: Vec<f64> = all.iter().map(|start| start.1).collect();
+    let mut table = Table::new(
+        "Start of a servant, until it has answered a first call (s)",
+        ["figure", "published", "here", "servants started"],
+    );
+    for (name, value) in [
+        ("median", median(&times)),
+        ("slowest", quantile(&times, 1.0)),
+    ] {
+        table.push([
+            name.to_owned(),
+            "over 5".to_owned(),
+            value.map_or_else(|| "–".to_owned(), digits),
+            times.len().to_string(),
+        ]);
+    }
+    section.tables.push(table);
+    let caption = "Start of the next servant";
+    let series = [Series::new(
+        "",
+        all.iter()
+            .map(|(number, time)| (*number as f64, *time))
+            .collect(),
+    )];
+    let drawing = plots::points(caption, "servants on the node", "start (s)", &series, false)?;
+    section.drawing("scale-starts", caption, drawing);
+    let tenth = (times.len() / 10).max(1);
+    let (first, last) = (
+        median(&times[..tenth]),
+        median(&times[times.len() - tenth..]),
+    );
+    if let (Some(first), Some(last)) = (first, last) {
+        section.findings.push(format!(
+            "A new servant has answered its robot's first call after {} s at first and after {} s at last ({} times); over 5 s were published.",
+            digits(first),
+            digits(last),
+            ratio(Some(last / first))
+        ));
+    }
+    Ok(())
+}
+
+fn points(told: &[Told], node: Option<&Node>, section: &mut Section) {
+    let mut table = Table::new(
+        "Response times",
+        [
+            "robots",
+            "for the model",
+            "requests a second",
+            "RRT, median (ms)",
+            "RRT, 95 % (ms)",
+            "RRT, mean (ms)",
+            "the model's mean (ms)",
+            "its error (%)",
+            "machine busy (%)",
+        ],
+    );
+    for one in told {
+        let predicted = node.map(|node| node.at(one.plan.robots as u64).response);
+        let error = predicted
+            .zip(one.mean())
+            .map(|(predicted, mean)| predicted / mean - 1.0);
+        table.push([
+            one.plan.robots.to_string(),
+            if one.held_back { "held back" } else { "fitted" }.to_owned(),
+            digits(one.point.times.len() as f64 / one.point.lasted),
+            milliseconds(median(&one.point.times)),
+            milliseconds(quantile(&one.point.times, 0.95)),
+            milliseconds(one.mean()),
+            milliseconds(predicted),
+            error.map_or_else(|| "–".to_owned(), |error| format!("{:+.1}", error * 100.0)),
+            format!("{:.0}", one.busy() * 100.0),
+        ]);
+    }
+    section.tables.push(table);
+}
+
+fn costs(told: &[Told], section: &mut Section) -> Result<()> {
+    let mut table = Table::new(
+        "What a robot costs",
+        [
+            "robots",
+            "memory of its servant (MB)",
+            "memory that the machine has less (MB)",
+            "processor per request: servant (ms)",
+            "daemon (ms)",
+            "robot (ms)",
+        ],
+    );
+    for one in told {
+        let used = &one.point.used;
+        table.push([
+            one.plan.robots.to_string(),
+            digits(one.point.servants_memory / one.robots() / MEGA),
+            digits(one.point.taken / one.robots() / MEGA),
+            digits(one.milliseconds_each(used.servants)),
+            digits(one.milliseconds_each(used.daemon)),
+            digits(one.milliseconds_each(used.robots)),
+        ]);
+    }
+    section.tables.push(table);
+    let line = |name: &str, bytes: fn(&Point) -> f64| {
+        let points = told
+            .iter()
+            .map(|one| (one.robots(), bytes(one.point) / MEGA));
+        Series::new(name, points.collect())
+    };
+    let caption = "Memory of all robots together";
+    let series = [
+        line("less on the machine", |point| point.taken),
+        line("control groups of servants", |point| point.servants_memory),
+    ];
+    let drawing = plots::lines(caption, "robots", "memory (MB)", &series, false)?;
+    section.drawing("scale-memory", caption, drawing);
+    Ok(())
+}
+
+/// Where the response time begins to grow, and what is used up there.
+fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
+    let times: Vec<Option<f64>> = told.iter().map(|one| median(&one.point.times)).collect();
+    let Some(alone) = times[0] else { return };
+    let bent = times
+        .iter()
+        .position(|time| time.is_some_and(|time| time >= BENT * alone));
+    let at = &told[bent.unwrap_or(told.len() - 1)];
+    let memory = 1.0 - at.point.left.0 / at.point.left.1;
+    let state = format!(
+        "the cores are {:.0} % busy, and {:.0} % of the memory is used",
+        at.busy() * 100.0,
+        memory * 100.0
+    );
+    let knee = node.map(Node::knee).map(|knee| {
+        format!(" By the model robots begin to wait for one another at {knee:.0} robots.")
+    });
+    let knee = knee.unwrap_or_default();
+    let room = at.plan.robots as f64 + at.point.left.0 / at.memory();
+    let room = format!(
+        "memory, {} MB for each robot, would be enough for {} robots",
+        digits(at.memory() / MEGA),
+        digits(room)
+    );
+    let robots = at.plan.robots;
+    section.findings.push(if bent.is_none() {
+        format!(
+            "Up to {robots} robots the curve does not bend: the median is {} times that of {}; {state}, and {room}.{knee}",
+            ratio(times[times.len() - 1].map(|time| time / alone)),
+            told[0].plan.robots,
+        )
+    } else if at.busy() >= FULL {
+        format!(
+            "At {robots} robots the median is {BENT} times that alone or more, because the processor is used up: {state}; {room}.{knee}"
+        )
+    } else if memory >= FULL {
+        format!(
+            "At {robots} robots the median is {BENT} times that alone or more, because memory is used up: {state}.{knee}"
+        )
+    } else {
+        format!(
+            "At {robots} robots the median is {BENT} times that alone or more, although {state}: requests come by chance and wait for \
+             each other before the cores are used up; {room}.{knee}"
+        )
+    });
+}
+
+fn model(told: &[Told], node: &Node, section: &mut Section) -> Result<()> {
+    let most = told.iter().map(|one| one.plan.robots).max().unwrap_or(1);
+    let curve = (1..=most as u64).map(|robots| (robots as f64, node.at(robots).response * 1e3));
+    let measured = |held_back: bool| -> Vec<(f64, f64)> {
+        let some = told.iter().filter(|one| one.held_back == held_back);
+        some.filter_map(|one| Some((one.robots(), one.mean()? * 1e3)))
+            .collect()
+    };
+    let caption = "Mean response time by robots, and the queue that was fitted";
+    let drawing = plots::curves(
+        caption,
+        "robots",
+        "mean response time (ms)",
+        &[Series::new("model", curve.collect())],
+        &[
+            Series::new("measured, the model was fitted to", measured(false)),
+            Series::new("measured, held back", measured(true)),
+        ],
+        false,
+    )?;
+    section.drawing("scale-model", caption, drawing);
+    section.findings.push(format!(
+        "A closed queue (machine repair, M/M/c//N) of {} cores, with {} ms of a core and {} ms of other waiting for each request and {} \
+         ms of pause, predicts {}.",
+        node.cores,
+        digits(node.service * 1e3),
+        digits(node.delay * 1e3),
+        digits(node.think * 1e3),
+        error_of(told, node)
+    ));
+    nodes(told, node, section);
+    Ok(())
+}
+
+/// How far the model is off where it was not fitted.
+fn error_of(told: &[Told], node: &Node) -> String {
+    let held_back = told.iter().filter(|one| one.held_back);
+    let errors: Vec<(usize, f64)> = held_back
+        .filter_map(|one| {
+            let predicted = node.at(one.plan.robots as u64).response;
+            Some((one.plan.robots, (predicted / one.mean()? - 1.0) * 100.0))
+        })
+        .collect();
+    let sizes: Vec<f64> = errors.iter().map(|error| error.1.abs()).collect();
+    let (Some(mean), Some(most)) = (mean(&sizes), quantile(&sizes, 1.0)) else {
+        return "what was not checked: no point that was held back was measured".to_owned();
+    };
+    let each: Vec<String> = errors
+        .iter()
+        .map(|(robots, error)| format!("{error:+.1} % at {robots}"))
+        .collect();
+    format!(
+        "the mean response times that were held back within {mean:.1} % on average, {most:.1} % at most ({})",
+        each.join(", ")
+    )
+}
+
+/// Nodes like this one that more robots need.
+fn nodes(told: &[Told], node: &Node, section: &mut Section) {
+    let last = &told[told.len() - 1];
+    // Robots are elsewhere then.
+    let beside = last.point.used.robots / last.point.used.requests();
+    let alone = Node {
+        service: node.service * (1.0 - beside),
+        ..*node
+    };
+    let memory = (MEMORY_PART * last.point.left.1 / last.memory()) as u64;
+    let admits = last.point.admits;
+    let caption = format!(
+        "Nodes like this one ({} cores, {:.0} GB) for a mean response time of {:.0} ms at most",
+        node.cores,
+        last.point.left.1 / 1e9,
+        T_MAX * 1e3
+    );
+    let mut table = Table::new(
+        caption,
+        [
+            "robots",
+            "robots per node by the model",
+            "by memory",
+            "by what the daemon reserves",
+            "nodes needed",
+        ],
+    );
+    for robots in MANY {
+        let served = alone.serves(robots, T_MAX);
+        let each = served.min(memory).min(admits);
+        let needed = if each == 0 {
+            "no number is enough".to_owned()
+        } else {
+            robots.div_ceil(each).to_string()
+        };
+        table.push([
+            robots.to_string(),
+            served.to_string(),
+            memory.to_string(),
+            admits.to_string(),
+            needed.clone(),
+        ]);
+        section.findings.push(format!(
+            "{robots} such robots need {needed} nodes like this one for {:.0} ms at most on average: {}.",
+            T_MAX * 1e3,
+            match each {
+                0 => "even one robot alone waits longer".to_owned(),
+                each if each == served => format!("its processor serves {each} each"),
+                each if each == memory => format!("its memory has room for {each} each"),
+                each => format!("its daemon makes room for {each} each, although its processor would serve {served}"),
+            }
+        ));
+    }
+    section.tables.push(table);
+    section.differs.push(format!(
+        "Nodes are counted without the robots' own part of the processor ({:.0} % here), without a network, and as if robots were spread \
+         evenly: what a machine that spreads them would take is not in it.",
+        beside * 100.0
+    ));
+    if last.busy() < FULL {
+        section.differs.push(format!(
+            "The cores were at most {:.0} % busy in this run: what the model says of more robots was not checked.",
+            last.busy() * 100.0
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests;

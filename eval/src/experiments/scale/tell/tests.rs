@@ -1,0 +1,113 @@
+use super::*;
+use crate::experiments::scale::counters::Cores;
+
+/// A node of which everything is known: 2 cores, 10 ms of a core for each request, of which the robot uses 1 ms, 2 ms of delay.
+const NODE: Node = Node {
+    cores: 2.0,
+    think: THINK,
+    service: 0.010,
+    delay: 0.002,
+};
+
+fn measured(robots: usize) -> (Plan, Measured<Point>) {
+    let plan = Plan {
+        robots,
+        settles: 1.0,
+        lasts: 10.0,
+        think: THINK,
+        work: 8,
+        cores: 2.0,
+    };
+    let closed = NODE.at(robots as u64);
+    let requests = (closed.throughput * 10.0).round() as usize;
+    let point = Point {
+        starts: vec![(robots, 0.3)],
+        times: vec![closed.response; requests],
+        lasted: 10.0,
+        used: Cores {
+            machine: closed.busy * 2.0,
+            daemon: closed.busy * 2.0 * 0.1,
+            servants: closed.busy * 2.0 * 0.8,
+            robots: closed.busy * 2.0 * 0.1,
+        },
+        servants_memory: robots as f64 * 20e6,
+        taken: robots as f64 * 25e6,
+        left: (16e9 - robots as f64 * 25e6, 20e9),
+        admits: 200,
+    };
+    (plan, Measured::Done(point))
+}
+
+fn told(robots: &[usize]) -> Section {
+    let runs = Runs(robots.iter().map(|robots| measured(*robots)).collect());
+    section(&runs).expect("it is told")
+}
+
+fn finding<'a>(section: &'a Section, word: &str) -> &'a str {
+    let found = section
+        .findings
+        .iter()
+        .find(|finding| finding.contains(word));
+    found.unwrap_or_else(|| panic!("{word}: {:#?}", section.findings))
+}
+
+#[test]
+fn the_model_is_checked_where_it_was_not_fitted() {
+    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let model = finding(&section, "closed queue");
+    assert!(
+        model.contains("of 2 cores, with 10.00 ms of a core and 2.00"),
+        "{model}"
+    );
+    assert!(
+        model.contains("within 0.0 % on average, 0.0 % at most"),
+        "{model}"
+    );
+    assert_eq!(section.tables[1].rows[1][1], "held back");
+    assert_eq!(section.tables[1].rows[2][1], "fitted");
+    assert!(section.missing.is_empty());
+}
+
+/// 9 ms of a core without the robots: 222 requests a second, which robots that ask every 0.3 s make 66.7 of; with chance, somewhat fewer.
+#[test]
+fn nodes_are_counted_by_what_is_scarce() {
+    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let table = section.tables.last().expect("nodes");
+    let each: u64 = table.rows[0][1].parse().expect("a number");
+    assert!((60..=67).contains(&each), "{each}");
+    assert_eq!(table.rows[0][2..4], ["720", "200"]);
+    assert_eq!(table.rows[1][4], 100_000u64.div_ceil(each).to_string());
+    assert!(finding(&section, "100000 such robots").contains("its processor serves"));
+}
+
+#[test]
+fn the_bend_and_its_reason_are_told() {
+    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let bend = finding(&section, "times that alone");
+    assert!(
+        bend.starts_with("At 64 robots") && bend.contains("the processor is used up"),
+        "{bend}"
+    );
+    let few = told(&[1, 2, 4]);
+    let bend = finding(&few, "does not bend");
+    assert!(bend.starts_with("Up to 4 robots"), "{bend}");
+    assert!(
+        few.differs
+            .iter()
+            .any(|words| words.contains("was not checked"))
+    );
+}
+
+#[test]
+fn what_is_missing_is_named_and_the_rest_is_told() {
+    let mut runs = Runs([1, 2, 4].map(measured).into());
+    runs.0[2].1 = Measured::Missing("no room".to_owned());
+    let section = section(&runs).expect("it is told");
+    let whats: Vec<&str> = section
+        .missing
+        .iter()
+        .map(|one| one.what.as_str())
+        .collect();
+    assert_eq!(whats, ["4 robots", "the queueing model"]);
+    assert_eq!(section.tables[0].rows[0][1..3], ["over 5", "0.30"]);
+}
