@@ -13,6 +13,7 @@ use crate::line::{self, Framing, Line};
 use crate::node::{IMAGE, Inside, Node, STRING, Type};
 use crate::raw::Raw;
 use crate::relay::{Hops, Relay};
+use crate::suite;
 
 /// A way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,6 +26,8 @@ pub(crate) enum Way {
     Values,
     /// The node itself, by TCPROS.
     Direct,
+    /// The server of rosbridge_suite in the same servant, JSON.
+    Suite,
 }
 
 /// rosbridge's names: `none`, `cbor`, `cbor-raw`.
@@ -44,6 +47,7 @@ impl fmt::Display for Way {
             Way::Bytes => "byte relay",
             Way::Values => "serde_json::Value",
             Way::Direct => "TCPROS, no hop between",
+            Way::Suite => suite::NAME,
         })
     }
 }
@@ -80,6 +84,7 @@ impl Course<'_> {
             Way::Daemon(encoding) => self.daemon(encoding)?,
             Way::Bytes | Way::Values => self.relay(way == Way::Values)?,
             Way::Direct => self.direct()?,
+            Way::Suite => self.bridge(suite::client(self.node)?, Encoding::Json)?,
         };
         for topic in topics.into_iter().flatten() {
             self.node.until_connected(topic, 1)?;
@@ -88,7 +93,11 @@ impl Course<'_> {
     }
 
     fn daemon(&self, encoding: Encoding) -> Result<Open> {
-        let mut line = Line::robot(self.daemon)?;
+        self.bridge(Line::robot(self.daemon)?, encoding)
+    }
+
+    /// By rosbridge's protocol, on a line to whoever speaks it.
+    fn bridge(&self, mut line: Line, encoding: Encoding) -> Result<Open> {
         let (kind, mut message) = (self.kind(), Vec::new());
         if let Some(topic) = self.hops.outward {
             let compression = match encoding {
@@ -198,7 +207,7 @@ impl Course<'_> {
 pub(crate) fn check(way: Way, images: bool, message: &[u8]) -> Result<()> {
     let expected = self::message(images);
     match way {
-        Way::Daemon(Encoding::Json) | Way::Values => {
+        Way::Daemon(Encoding::Json) | Way::Values | Way::Suite => {
             let op: Value = serde_json::from_slice(message)?;
             let data = op["msg"]["data"].as_str().context("data")?;
             let length = if images {

@@ -90,7 +90,11 @@ impl Line {
 
     /// A WebSocket at `ws://ADDRESS/PATH`.
     pub(crate) fn websocket(address: &str, path: &str) -> Result<Self> {
-        let stream = TcpStream::connect(address)?;
+        Self::websocket_over(TcpStream::connect(address)?, address, path)
+    }
+
+    /// The same over a connection that is there.
+    pub(crate) fn websocket_over(stream: TcpStream, address: &str, path: &str) -> Result<Self> {
         let kept = stream.try_clone()?;
         match tungstenite::client(format!("ws://{address}/{path}"), stream) {
             // A server that is not spoken to says nothing: there is nothing in its buffer.

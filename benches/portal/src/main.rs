@@ -1,6 +1,6 @@
 //! `make bench ONLY=portal`: how fast messages and calls pass the daemon, between a client on loopback and a roscpp node
 //! in a servant. Beside it, in turns: the same node by raw TCPROS; a process that moves the bytes over the same hops;
-//! one that converts them by way of a tree of values; and another daemon that speaks TLS and holds a robot to its token and
+//! one that converts them by way of a tree of values; rosbridge_suite, where its sources are named; and another daemon that speaks TLS and holds a robot to its token and
 //! the policy. Before that, WebSocket framing alone, beside other libraries of it
 //! (`make bench ONLY=portal`; the words `framing of` as an argument run that part alone). Needs root. The program calls itself for the relays
 //! (`relay PID HOW …`).
@@ -16,9 +16,12 @@ mod raw;
 mod relay;
 mod secure;
 mod slow_reader;
+mod suite;
 mod trips;
 mod value;
 mod watch;
+
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail, ensure};
 use bench_report::{Report, Target};
@@ -47,18 +50,31 @@ fn main() -> Result<()> {
     }
 }
 
-/// Publishes the node that everything is measured with.
+/// Publishes the node that everything is measured with, and nothing else.
 fn push(daemon: &Daemon) -> Result<()> {
     eprintln!("pushing rosbridge_fixture");
-    let fixture = bench_report::root().join("tests/packages/rosbridge_fixture");
     daemon.push(&[
-        fixture.to_str().context("UTF-8")?,
+        fixture().to_str().context("UTF-8")?,
         "--name",
         "meter",
         "--node",
         "rosbridge_fixture/meter",
     ])?;
     Ok(())
+}
+
+fn fixture() -> PathBuf {
+    bench_report::root().join("tests/packages/rosbridge_fixture")
+}
+
+/// Publishes it with rosbridge_suite beside it, or alone; whether that is there.
+fn push_with_suite(report: &mut Report, daemon: &Daemon) -> Result<bool> {
+    let Err(why) = suite::push(daemon, &fixture()) else {
+        return Ok(true);
+    };
+    report.left_out(suite::NAME, format!("{why:#}"));
+    push(daemon)?;
+    Ok(false)
 }
 
 /// All figures whose names contain `only`.
@@ -78,10 +94,10 @@ fn measure(only: &str) -> Result<()> {
         .prefix("cloudroid-bench-")
         .tempdir()?;
     let daemon = Daemon::start(place, CONFIG, &[])?;
-    push(&daemon)?;
+    let suite = push_with_suite(&mut report, &daemon)?;
     let node = Node::find(&daemon)?;
     let watch = Watch::over(daemon.pid());
-    trips::measure(&mut report, &daemon, &node, only)?;
+    trips::measure(&mut report, &daemon, &node, only, suite)?;
     rates::measure(&mut report, &daemon, &node, only)?;
     secure::measure(&mut report, &daemon, &node, only)?;
     // The node may still owe messages afterwards, which nobody counts.

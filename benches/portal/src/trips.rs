@@ -13,8 +13,14 @@ use crate::relay::Hops;
 /// Per turn; the first tenth does not count.
 const TRIPS: usize = 3000;
 
-/// A String through the node and back; a call.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &str) -> Result<()> {
+/// A String through the node and back; a call. Also by rosbridge_suite, if the `suite` is there.
+pub(crate) fn measure(
+    report: &mut Report,
+    daemon: &Daemon,
+    node: &Node,
+    only: &str,
+    suite: bool,
+) -> Result<()> {
     let string = Hops {
         inward: Some("/meter/ping"),
         outward: Some("/meter/pong"),
@@ -25,7 +31,8 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &
         ..Hops::default()
     };
     let daemons = Way::Daemon(Encoding::Json);
-    let all = [daemons, Way::Bytes, Way::Values, Way::Direct];
+    let mut all = vec![daemons, Way::Bytes, Way::Values, Way::Direct];
+    all.extend(suite.then_some(Way::Suite));
     // Trees of values for calls would be a service stack of their own.
     let calling = [daemons, Way::Bytes, Way::Direct];
     for (what, hops, ways, targets) in [

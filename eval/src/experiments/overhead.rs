@@ -195,6 +195,7 @@ fn compared(peer: &str, ours: f64, theirs: f64) -> String {
 
 const TRIP: &str = "String there and back";
 const LINK: &str = "String there and back over the link: p50";
+const SECURE: &str = "String there and back, TLS and policy";
 const DIRECT: &str = "TCPROS, no hop between";
 
 fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Written>) {
@@ -241,6 +242,12 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
             row(name, other(&p50, way), other(&p99, way));
         }
         row("portal, JSON", value(written, &p50), value(written, &p99));
+        let secure = ["p50", "p99"].map(|quantile| format!("{SECURE}, {quantile}"));
+        row(
+            "portal, JSON, TLS, a robot's token and its rights",
+            value(written, &secure[0]),
+            value(written, &secure[1]),
+        );
         row(
             "rosbridge_suite, JSON",
             other(&p50, SUITE),
@@ -333,8 +340,8 @@ mod tests {
         let rows = &section.tables[1].rows;
         assert_eq!(rows[0], ["raw TCPROS", "40.0", "40.0", "0.00", "1.0"]);
         assert_eq!(rows[3], ["portal, JSON", "60.0", "90.0", "20.0", "1.5"]);
-        assert_eq!(rows[4][1..], ["–", "–", "–", "–"]);
-        assert_eq!(rows[5], ["stub and link", "80.0", "–", "40.0", "2.0"]);
+        assert_eq!(rows[5][1..], ["–", "–", "–", "–"]);
+        assert_eq!(rows[6], ["stub and link", "80.0", "–", "40.0", "2.0"]);
         let why = section.differs.last().expect("some");
         assert_eq!(why, "rosbridge_suite was not measured: it is not packaged.");
     }

@@ -8,7 +8,7 @@ use super::model::Model;
 use super::told::PUBLISHED;
 use super::{Found, total};
 
-/// Points that were fitted, points that were held back, and the model between them.
+/// The model, points that were fitted, and points that were held back.
 pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
     let of = |fitted: bool| {
         let chosen = one.points.iter().filter(move |point| point.2 == fitted);
@@ -20,20 +20,19 @@ pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
         .map(|point| point.0)
         .fold(model.most, f64::min);
     let steps = (0..=300).map(|step| least + (model.most - least) * f64::from(step) / 300.0);
+    let curve = steps.map(|cores| (cores, model.cautious(cores))).collect();
+    // Points stand upon the curve.
     let series = [
+        Series::new("model", curve),
         Series::new("fitted", of(true)),
         Series::new("held back", of(false)),
-        Series::new(
-            "model",
-            steps.map(|cores| (cores, model.cautious(cores))).collect(),
-        ),
     ];
     plots::points(
         one.name(),
         "cores of the servant",
         "mean response time, s",
         &series,
-        true,
+        false,
     )
 }
 
