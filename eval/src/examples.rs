@@ -195,6 +195,7 @@ impl<'a> Workshop<'a> {
                 executable: example.executable.to_owned(),
                 argv,
                 settings: format!("service = \"{}\"\nlocal = \"none\"", example.name),
+                environment: Vec::new(),
             },
         };
         Ok(Plan {
@@ -212,6 +213,7 @@ impl<'a> Workshop<'a> {
             most: example.requests,
             give_up: GIVE_UP,
             patience: 600.0,
+            changes: Vec::new(),
         })
     }
 

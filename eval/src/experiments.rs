@@ -1,8 +1,10 @@
 //! The experiments, one file each: how it is measured, and what the report says of it.
 
 pub mod benches;
+pub mod codecs;
 pub mod cores;
 pub mod crowd;
+pub mod failover;
 pub mod map;
 pub mod memory;
 pub mod neighbours;

@@ -21,5 +21,6 @@ pub mod report;
 pub mod robot;
 pub mod section;
 pub mod statistics;
+pub mod stream;
 pub mod trace;
 pub mod words;

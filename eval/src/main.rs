@@ -13,7 +13,7 @@ use eval::cells::Cells;
 use eval::examples::Workshop;
 use eval::experiments::crowd::Yard;
 use eval::experiments::{
-    benches, cores, map, memory, neighbours, outsourcing, overhead, scale, transparency,
+    codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
 };
 use eval::section::Section;
 use eval::{report, robot};
@@ -114,12 +114,20 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
     if wanted(3) {
         sections.push(memory::section(&memory::measure(cells, workshop)?));
     }
+    if wanted(6) {
+        let runs = failover::measure(cells, workshop, arguments.quick)?;
+        sections.push(failover::section(&runs)?);
+    }
     if wanted(7) {
         sections.push(map::section(&map::measure(
             cells,
             workshop,
             most.map(|most| most * 3),
         )?)?);
+    }
+    if wanted(8) {
+        let runs = codecs::measure(cells, workshop, arguments.quick)?;
+        sections.push(codecs::section(&runs)?);
     }
     if [9, 10].into_iter().any(wanted) {
         let place = workshop.directory()?;
@@ -133,13 +141,8 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
             sections.push(scale::section(&runs)?);
         }
     }
-    if !arguments.quick {
-        if wanted(11) {
-            sections.push(overhead::section(&overhead::measure(cells)?)?);
-        }
-        for bench in benches::ALL.iter().filter(|bench| wanted(bench.number())) {
-            sections.push(benches::section(bench, &benches::measure(cells, bench)?));
-        }
+    if !arguments.quick && wanted(11) {
+        sections.push(overhead::section(&overhead::measure(cells)?)?);
     }
     sections.sort_by_key(|section| section.number);
     Ok(sections)

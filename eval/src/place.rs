@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
+use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -23,6 +24,8 @@ const END: Duration = Duration::from_secs(20);
 /// Between two looks at whether the robot has ended.
 const LOOK: Duration = Duration::from_millis(50);
 const GIB: u64 = 1 << 30;
+/// The answer to a robot that asked for another network.
+const DONE: &str = "done";
 
 /// A kind of robot computer.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -61,6 +64,8 @@ pub enum Network {
     Wan,
     /// 5 ms each way, more or less 4 ms, 40 Mbit/s, one packet in a hundred is lost.
     Wifi,
+    /// 100 ms each way, 2 Mbit/s, one packet in a hundred is lost: what the benchmark `failover` calls bad.
+    Bad,
 }
 
 impl Network {
@@ -70,6 +75,7 @@ impl Network {
             Self::Lan => "LAN",
             Self::Wan => "WAN",
             Self::Wifi => "Wi-Fi",
+            Self::Bad => "bad",
         }
     }
 
@@ -79,13 +85,14 @@ impl Network {
             Self::Lan => (100_000, 1, 0, 0.0),
             Self::Wan => (20_000, 30, 0, 0.0),
             Self::Wifi => (40_000, 5, 4, 0.01),
+            Self::Bad => (2000, 100, 0, 0.01),
         };
         Badness {
             rate,
             delay,
             jitter,
             loss,
-            limit: 1000,
+            limit: if self == Self::Bad { 100 } else { 1000 },
         }
     }
 }
@@ -177,12 +184,20 @@ impl Place {
             .arg(std::env::current_exe()?)
             .arg("robot")
             .args([&order, &answer])
-            .stdin(Stdio::null())
-            .stdout(said.try_clone()?)
+            // What a robot that is killed leaves goes with the run's directory.
+            .env("TMPDIR", directory)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
             .stderr(said)
             .spawn()
             .context("nsenter, of util-linux")?;
-        let ended = waits(&mut child, Duration::from_secs_f64(plan.patience));
+        let (wishes, answers) = (child.stdout.take(), child.stdin.take());
+        let ended = std::thread::scope(|scope| {
+            if let (Some(wishes), Some(answers)) = (wishes, answers) {
+                scope.spawn(|| self.changes(BufReader::new(wishes), answers));
+            }
+            waits(&mut child, Duration::from_secs_f64(plan.patience))
+        });
         let killed = self.cgroup.oom_kills();
         if let Err(error) = ended {
             let said = std::fs::read_to_string(&log).unwrap_or_default();
@@ -211,6 +226,36 @@ impl Place {
         };
         Ok((trace, cost))
     }
+
+    /// Makes the network what the robot asks for in lines of its output, until that ends, and answers each when it is done. A robot
+    /// that hears no answer goes no further.
+    fn changes(&self, wishes: impl BufRead, mut answers: impl Write) {
+        for line in wishes.lines().map_while(Result::ok) {
+            let Ok(network) = serde_json::from_str::<Network>(&line) else {
+                eprintln!("the robot said: {line}");
+                continue;
+            };
+            // What waits in the network that was goes with it, as on a robot that changes its access point.
+            let made = self.cable.restore();
+            let made = made.and_then(|()| self.cable.degrade(network.rules()));
+            if let Err(error) = made {
+                eprintln!("the network cannot be changed: {error:#}");
+                return;
+            }
+            if writeln!(answers, "{DONE}").is_err() {
+                return;
+            }
+        }
+    }
+}
+
+/// The robot's side of a wish for another network: returns when it is there.
+pub fn asks_for(network: Network) -> Result<()> {
+    println!("{}", serde_json::to_string(&network)?);
+    let mut answer = String::new();
+    std::io::stdin().read_line(&mut answer)?;
+    ensure!(answer.trim() == DONE, "the network could not be changed");
+    Ok(())
 }
 
 impl Drop for Place {

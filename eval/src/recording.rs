@@ -7,6 +7,8 @@ use anyhow::{Context, Result, ensure};
 use bytes::{Buf, Bytes};
 use ros::bag::{self, Recorded};
 
+use crate::stream;
+
 /// Of pictures.
 const SIZE: (u32, u32) = (640, 480);
 /// Between two pictures, nanoseconds.
@@ -30,13 +32,17 @@ pub struct Step<'a> {
 }
 
 impl Recording {
-    /// Reads a rosbag file that is not compressed, or a file that ends with `.raw`: pictures of 640x480, bgr8, one after the other, ten
-    /// a second.
+    /// Reads a rosbag file that is not compressed, a file of [`stream`] that ends with `.messages`, or a file that ends with `.raw`: pictures
+    /// of 640x480, bgr8, one after the other, ten a second.
     pub fn read(path: &Path) -> Result<Self> {
         let named = || path.display().to_string();
         let file = Bytes::from(std::fs::read(path).with_context(named)?);
         if path.extension().is_some_and(|ending| ending == "raw") {
             return Ok(pictures(&file));
+        }
+        if path.extension().is_some_and(|ending| ending == "messages") {
+            let messages = stream::read(&file).with_context(named)?;
+            return Ok(Self { messages });
         }
         let mut messages = bag::read(&file, usize::MAX).with_context(named)?;
         messages.sort_by_key(|message| message.time);

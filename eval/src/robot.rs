@@ -1,6 +1,9 @@
 //! What runs in a robot's place: a ROS Master, the robot's own node, which plays a recording and hears the answers, and the package as it is
 //! installed there or its stub.
 
+mod carried;
+mod rate;
+
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,13 +18,14 @@ use servant::cgroup::Cgroup;
 use support::site::{Running, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
+use crate::place::Network;
 use crate::recording::{Recording, Step, header, numbers, pose, restamped};
 use crate::trace::{Grid, Phases, Request, Trace};
 
 /// Stamps of requests begin after this one.
-const FIRST: u32 = 1000;
+pub const FIRST: u32 = 1000;
 /// Requests whose answers are not counted: by then all are connected and awake.
-const WARM_UP: usize = 3;
+pub const WARM_UP: usize = 3;
 /// An answer to a request of the warm-up; a node of several seconds' start is waited for.
 const BEGINNING: Duration = Duration::from_secs(40);
 /// For answers that are under way after the last request that is played at a rate.
@@ -58,6 +62,9 @@ pub struct Plan {
     pub give_up: f64,
     /// Seconds after which the whole run does.
     pub patience: f64,
+    /// Of requests at a rate: before this one, counted from 1, the network becomes that one.
+    #[serde(default)]
+    pub changes: Vec<(usize, Network)>,
 }
 
 /// When requests are published.
@@ -68,6 +75,13 @@ pub enum Pace {
     OneByOne,
     /// At their recorded times, so much faster.
     Recorded(f64),
+    /// At a rate, all again from the first after the last, once some were answered in time.
+    Rate {
+        /// Requests per second.
+        hertz: f64,
+        /// Seconds within which an answer is in time.
+        in_time: f64,
+    },
 }
 
 /// Who answers on the robot.
@@ -93,6 +107,9 @@ pub enum Node {
         argv: Vec<String>,
         /// Lines of `stub.toml` beside the server's address.
         settings: String,
+        /// Variables in its environment.
+        #[serde(default)]
+        environment: Vec<(String, String)>,
     },
 }
 
@@ -130,6 +147,9 @@ fn run(plan: &Plan) -> Result<Trace> {
     let mut trace = asked.with_context(|| format!("the node said: {}", node.said()))?;
     if let Node::Stub { .. } = plan.node {
         trace.answered_locally = node.said().matches("answer=Some((Local").count();
+        rate::told(&node.said(), &mut trace.requests);
+        let warns = |line: &&str| line.contains(" WARN ");
+        trace.warnings = node.said().lines().filter(warns).map(str::to_owned).collect();
     }
     if trace.node_ended.is_none() {
         // As roslaunch would.
@@ -172,14 +192,16 @@ fn start(site: &Site, plan: &Plan) -> Result<Running> {
             executable,
             argv,
             settings,
+            environment: besides,
         } => {
             let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
             let toml = format!("server = \"{}\"\n{settings}\n", plan.server);
-            let environment = [
+            let mut environment = vec![
                 ("ROS_IP", "127.0.0.1"),
                 ("NO_COLOR", "1"),
                 ("CLOUDROID_LOG", "info,requests=debug"),
             ];
+            environment.extend(besides.iter().map(|(name, value)| (&**name, &**value)));
             site.stub_among(&environment, &toml, package, executable, &argv)
         }
     }
@@ -212,6 +234,10 @@ fn ask(
         let mut trace = match plan.pace {
             Pace::OneByOne => ends.one_by_one(plan, &chosen, node).await?,
             Pace::Recorded(speed) => ends.as_recorded(speed, &chosen, node).await?,
+            Pace::Rate { hertz, in_time } => {
+                let cycle: Vec<&Step> = measured.iter().cycle().take(plan.most).collect();
+                ends.at_a_rate(plan, (hertz, in_time), &cycle, node).await?
+            }
         };
         ends.besides(&mut trace);
         Ok(trace)
@@ -270,6 +296,7 @@ impl Ends {
             if let Some(message) = self.answer(number, give_up).await {
                 answered(&mut request, &message, sent.elapsed());
                 request.pose = request.pose.filter(|_| plan.tells_pose);
+                request.carried = carried::so_far()?;
             }
             let lost = request.response.is_none();
             trace.requests.push(request);
@@ -324,6 +351,7 @@ impl Ends {
                 continue;
             };
             if let Some(request) = requests.get_mut(index) {
+                request.answers += 1;
                 if request.response.is_none() {
                     answered(request, &message, sent[index].elapsed());
                 }

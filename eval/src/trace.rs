@@ -17,6 +17,18 @@ pub struct Request {
     pub pose: Option<[f64; 3]>,
     /// Of the answer without its header's sequence number; equal for equal answers.
     pub digest: Option<u64>,
+    /// Bytes of packets that had left the robot and had come to it when the answer was there, since its place was made.
+    #[serde(default)]
+    pub carried: Option<[u64; 2]>,
+    /// How many answers came, of requests at a rate.
+    #[serde(default)]
+    pub answers: usize,
+    /// The first answer was that of the local original, as the stub tells.
+    #[serde(default)]
+    pub local: bool,
+    /// The stub's satisfaction with the cloud, Q, once this request was counted.
+    #[serde(default)]
+    pub satisfaction: Option<f64>,
 }
 
 /// Parts of one computation as SLAMBench divides them (Nardi et al., ICRA 2015), seconds.
@@ -56,6 +68,9 @@ pub struct Trace {
     pub map: Option<Grid>,
     /// Answers by the local original, where that is known.
     pub answered_locally: usize,
+    /// What its log warns of.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// How the node ended before its time; none where it went on to the end.
     pub node_ended: Option<String>,
 }

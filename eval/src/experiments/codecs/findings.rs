@@ -1,0 +1,94 @@
+//! What the figures of codecs say, in sentences.
+
+use super::sources::Alone;
+use super::told::{base, done, encoded, lan, saving};
+use super::{Kind, Runs, Sent, Setting, What};
+use crate::statistics::quantile;
+use crate::words::digits;
+
+/// Times as long is longer, and no chance.
+const SLOWER: f64 = 1.05;
+
+pub(super) fn findings(runs: &Runs) -> Vec<String> {
+    let mut findings: Vec<String> = lan(runs)
+        .filter(|(what, _)| what.setting != Setting::None)
+        .filter_map(|(what, sent)| Some(beside_published(what, saving(runs, what, sent)?)))
+        .collect();
+    for (what, sent) in done(runs).filter(|(what, _)| what.setting != Setting::None) {
+        findings.extend(as_they_are(runs, what, sent));
+        findings.extend(slower(runs, what, sent));
+    }
+    for (kind, alone) in &runs.alone {
+        if let Some(alone) = alone.done() {
+            findings.extend(larger_than_deflate(*kind, alone));
+        }
+    }
+    findings
+}
+
+fn beside_published(what: &What, saved: f64) -> String {
+    let (row, published) = what.kind.published();
+    let less = digits(published - saved);
+    let beside = if saved >= published {
+        "at least as many as".to_owned()
+    } else if what.setting.is_lossy() {
+        format!("{less} percentage points less than")
+    } else {
+        format!("{less} percentage points less than (and loses nothing)")
+    };
+    format!(
+        "{}: codec {} saves {saved:.1} % of the bytes, {beside} the publication's row {row} ({published} %).",
+        what.kind.name(),
+        what.setting.name()
+    )
+}
+
+/// Where the link did not encode what it could have encoded.
+fn as_they_are(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
+    let plain = sent.each.len() - encoded(runs, what, sent)?;
+    (plain > 0).then(|| {
+        format!(
+            "{}, codec {}, {}: {plain} of {} messages went as they are, which makes the saving smaller: the link encodes only while it measures less than 60 MB/s, and takes receipts that come in one go (after a lost packet, say) for a faster network.",
+            what.kind.name(),
+            what.setting.name(),
+            what.network.name(),
+            sent.each.len()
+        )
+    })
+}
+
+fn slower(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
+    let median = |sent: &Sent| quantile(&sent.responses, 0.5);
+    let (with, without) = median(sent).zip(median(base(runs, what)?.1))?;
+    (with > SLOWER * without).then(|| {
+        format!(
+            "{}, codec {}, {}: a message takes longer with the codec ({} ms) than without ({} ms): encoding and decoding take more time than the network needs for what they save.",
+            what.kind.name(),
+            what.setting.name(),
+            what.network.name(),
+            digits(with * 1e3),
+            digits(without * 1e3)
+        )
+    })
+}
+
+fn larger_than_deflate(kind: Kind, alone: &Alone) -> Option<String> {
+    let published = alone.codecs.iter().find(|made| !made.ours)?;
+    let ours = alone.codecs.iter().find(|made| made.ours)?;
+    let known = alone.known.map_or_else(String::new, |known| {
+        format!(
+            " Of its cells {:.1} % are known: what is not known costs nearly nothing, so that a map of which less is known saves more.",
+            100.0 * known
+        )
+    });
+    (ours.bytes[1] > published.bytes[1] || alone.known.is_some()).then(|| {
+        format!(
+            "{}: the codec {} makes {} bytes of a message where {} makes {}.{known}",
+            kind.name(),
+            ours.codec,
+            ours.bytes[1],
+            published.codec,
+            published.bytes[1]
+        )
+    })
+}

@@ -1,0 +1,404 @@
+//! What the report says of codecs.
+
+use anyhow::Result;
+
+use super::findings::findings;
+use super::{CLASS, HURRY, Kind, Runs, Sent, Setting, What, title};
+use crate::cells::Measured;
+use crate::place::Network;
+use crate::plots::{self, Bar};
+use crate::section::{Missing, Section, Table};
+use crate::statistics::quantile;
+use crate::words::milliseconds;
+
+/// A message is encoded if it takes less than this share of the bytes without a codec.
+const SMALLER: f64 = 0.9;
+
+/// What the report says.
+pub fn section(runs: &Runs) -> Result<Section> {
+    let mut section = Section::new(8, "codecs", "Bytes that codecs save");
+    section.published = "Table I of the publication: video by libav saves 75.4 %, images by deflate 96.1 %, grid maps by zlib 99.9 %; how much libav loses is not published.".to_owned();
+    section.differs = differs();
+    if runs.quick {
+        let left_out = "A quick evaluation sends the video alone, over the LAN: make eval ONLY=8 has photographs, maps, H.264 and the other networks.";
+        section.differs.push(left_out.to_owned());
+    }
+    section.tables = vec![saved(runs), times(runs), alone(runs)];
+    let mut bars = Vec::new();
+    for (what, sent) in lan(runs) {
+        if let Some(saved) = saving(runs, what, sent).filter(|_| what.setting != Setting::None) {
+            bars.push(bar(what.kind, what.setting.name(), saved));
+        }
+    }
+    let mut kinds: Vec<Kind> = lan(runs).map(|(what, _)| what.kind).collect();
+    kinds.dedup();
+    bars.extend(
+        kinds
+            .iter()
+            .map(|kind| bar(*kind, "published", kind.published().1)),
+    );
+    section.drawing(
+        "codecs-saved",
+        "Share of the bytes on the cable that each codec saves over the LAN, beside the published one",
+        plots::bars("Saved bytes", "%", &bars, false)?,
+    );
+    let responses: Vec<Bar> = done(runs)
+        .filter(|(what, _)| what.kind == Kind::Video)
+        .filter_map(|(what, sent)| {
+            let at = |share| quantile(&sent.responses, share).map(|seconds| seconds * 1e3);
+            Some(Bar {
+                group: what.network.name().to_owned(),
+                name: what.setting.name().to_owned(),
+                value: at(0.5)?,
+                spread: at(0.05).zip(at(0.95)),
+            })
+        })
+        .collect();
+    section.drawing(
+        "codecs-response",
+        "Response time of one picture of the video by codec and network: median, 5 % and 95 %",
+        plots::bars("From picture to receipt", "ms", &responses, true)?,
+    );
+    section.findings = findings(runs);
+    missing(&mut section, runs);
+    Ok(section)
+}
+
+fn differs() -> Vec<String> {
+    vec![
+        "Bytes are those of packets on the robot's cable, with the heads of TCP, IP and WebSocket; what is sent without a codec is the base of each saving.".to_owned(),
+        format!(
+            "A robot of the class {} sends one message after the other's receipt; the node in the servant answers with the header alone. The first messages are not counted: by then the link has measured itself and chosen.",
+            CLASS.name()
+        ),
+        format!(
+            "The codec is the key `codec` of stub.toml: none; auto (without loss: the best of several); jpeg (quality 80) and video (H.264, quantiser 22), which are taken where no codec without loss is quick enough: here T_max is {} s, so that they are.",
+            HURRY.1
+        ),
+        "The publication's video, image and map are not published: the video is vtest.avi of Debian's opencv-doc, images are photographs of the same package, scaled to 640x480, bgr8, the map is what laser_slam makes of a recorded drive, alone and in the middle of 4000 x 4000 cells, as gmapping publishes it.".to_owned(),
+        "No camera's picture becomes 96 % smaller by deflate, which loses nothing: what deflate and zlib make of the same messages, in one process, is in the last table.".to_owned(),
+    ]
+}
+
+pub(super) fn done(runs: &Runs) -> impl Iterator<Item = (&What, &Sent)> {
+    let streams = runs.streams.iter();
+    let done = streams.filter_map(|(what, sent)| Some((what, sent.done()?)));
+    // A codec that is not built in was not measured.
+    done.filter(|(_, sent)| sent.warning.is_none())
+}
+
+pub(super) fn lan(runs: &Runs) -> impl Iterator<Item = (&What, &Sent)> {
+    done(runs).filter(|(what, _)| what.network == Network::Lan)
+}
+
+/// Percent of the bytes to the servant that this codec saves on that network.
+pub(super) fn saving(runs: &Runs, what: &What, sent: &Sent) -> Option<f64> {
+    let (_, base) = base(runs, what)?;
+    Some(100.0 * (1.0 - sent.carried?[0] / base.carried?[0]))
+}
+
+/// Messages that were sent in clearly fewer bytes than without a codec.
+pub(super) fn encoded(runs: &Runs, what: &What, sent: &Sent) -> Option<usize> {
+    let (_, base) = base(runs, what).filter(|_| what.setting != Setting::None)?;
+    let whole = base.carried?[0];
+    let smaller = sent
+        .each
+        .iter()
+        .filter(|bytes| (**bytes as f64) < SMALLER * whole);
+    Some(smaller.count())
+}
+
+/// The same on the same network without a codec.
+pub(super) fn base<'a>(runs: &'a Runs, what: &What) -> Option<(&'a What, &'a Sent)> {
+    done(runs).find(|(base, _)| {
+        base.setting == Setting::None && base.kind == what.kind && base.network == what.network
+    })
+}
+
+fn percent(value: Option<f64>) -> String {
+    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.1} %"))
+}
+
+fn bytes(value: Option<f64>) -> String {
+    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.0}"))
+}
+
+fn saved(runs: &Runs) -> Table {
+    let mut table = Table::new(
+        "Over the LAN, for each message",
+        [
+            "what is sent",
+            "codec",
+            "published row",
+            "published: saved",
+            "saved here",
+            "bytes to the servant",
+            "bytes back",
+            "messages encoded",
+            "PSNR, median (least), dB",
+            "pictures that changed",
+        ],
+    );
+    for (what, sent) in lan(runs) {
+        let (row, published) = what.kind.published();
+        let base = what.setting == Setting::None;
+        let (noise, changed) = noise(runs, what);
+        table.push([
+            what.kind.name().to_owned(),
+            what.setting.name().to_owned(),
+            row.to_owned(),
+            percent(Some(published)),
+            if base {
+                "the base".to_owned()
+            } else {
+                percent(saving(runs, what, sent))
+            },
+            bytes(sent.carried.map(|ways| ways[0])),
+            bytes(sent.carried.map(|ways| ways[1])),
+            encoded(runs, what, sent).map_or_else(
+                || "–".to_owned(),
+                |encoded| format!("{encoded} of {}", sent.each.len()),
+            ),
+            noise,
+            changed,
+        ]);
+    }
+    table
+}
+
+/// Signal to noise, and how many pictures have changed.
+fn noise(runs: &Runs, what: &What) -> (String, String) {
+    if !what.setting.is_lossy() {
+        return ("lossless".to_owned(), "–".to_owned());
+    }
+    let received = runs.received.iter().find(|(of, _)| of == what);
+    let Some(received) = received.and_then(|(_, received)| received.done()) else {
+        return ("–".to_owned(), "–".to_owned());
+    };
+    let changed = received.psnr.len();
+    let all = changed + received.exact;
+    let (median, least) = (quantile(&received.psnr, 0.5), quantile(&received.psnr, 0.0));
+    let both = median.zip(least);
+    let noise = both.map(|(median, least)| format!("{median:.1} ({least:.1})"));
+    (
+        noise.unwrap_or_else(|| "lossless".to_owned()),
+        format!("{changed} of {all}"),
+    )
+}
+
+fn times(runs: &Runs) -> Table {
+    let mut table = Table::new(
+        "From publishing a message to its receipt, milliseconds (the publication has no such figure)",
+        [
+            "what is sent",
+            "codec",
+            "network",
+            "messages",
+            "lost",
+            "median",
+            "95 %",
+            "bytes to the servant",
+            "saved",
+            "messages encoded",
+        ],
+    );
+    for (what, sent) in done(runs) {
+        table.push([
+            what.kind.name().to_owned(),
+            what.setting.name().to_owned(),
+            what.network.name().to_owned(),
+            (sent.responses.len() + sent.lost).to_string(),
+            sent.lost.to_string(),
+            milliseconds(quantile(&sent.responses, 0.5)),
+            milliseconds(quantile(&sent.responses, 0.95)),
+            bytes(sent.carried.map(|ways| ways[0])),
+            match what.setting {
+                Setting::None => "the base".to_owned(),
+                _ => percent(saving(runs, what, sent)),
+            },
+            encoded(runs, what, sent).map_or_else(
+                || "–".to_owned(),
+                |encoded| format!("{encoded} of {}", sent.each.len()),
+            ),
+        ]);
+    }
+    table
+}
+
+fn alone(runs: &Runs) -> Table {
+    let mut table = Table::new(
+        "The same messages by one codec in one process, not on the cable",
+        [
+            "what",
+            "codec",
+            "published row",
+            "published: saved",
+            "saved here",
+        ],
+    );
+    for (kind, alone) in &runs.alone {
+        let (row, published) = kind.published();
+        for one in alone.done().iter().flat_map(|alone| &alone.codecs) {
+            let saved = 100.0 * (1.0 - one.bytes[1] as f64 / one.bytes[0] as f64);
+            table.push([
+                kind.name().to_owned(),
+                one.codec.clone(),
+                row.to_owned(),
+                percent(Some(published)),
+                format!("{saved:.2} %"),
+            ]);
+        }
+    }
+    table
+}
+
+fn bar(kind: Kind, name: &str, value: f64) -> Bar {
+    Bar {
+        group: kind.name().to_owned(),
+        name: name.to_owned(),
+        value,
+        spread: None,
+    }
+}
+
+fn missing(section: &mut Section, runs: &Runs) {
+    let again = "run make eval again: what was measured stays";
+    let mut add = |what: String, why: &str, next: &str| {
+        section.missing.push(Missing::new(what, why, next));
+    };
+    for (what, sent) in &runs.streams {
+        match sent {
+            Measured::Missing(why) => add(title(what), why, again),
+            Measured::Done(Sent {
+                warning: Some(why), ..
+            }) => add(
+                title(what),
+                why,
+                "build cloudroidd and cloudroid-stub with the feature video (docs/codecs.md)",
+            ),
+            Measured::Done(sent) if sent.carried.is_none() => add(
+                format!("{}: bytes on the cable", title(what)),
+                "the robot has no counters of its network, or nothing was answered",
+                again,
+            ),
+            Measured::Done(_) => {}
+        }
+    }
+    for (what, received) in &runs.received {
+        if let Measured::Missing(why) = received {
+            add(format!("{}: signal to noise", title(what)), why, again);
+        }
+    }
+    for (kind, alone) in &runs.alone {
+        if let Measured::Missing(why) = alone {
+            add(format!("{}: codecs alone", kind.name()), why, again);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Length;
+    use super::super::received::Received;
+    use super::super::sources::{Alone, Made};
+    use super::*;
+
+    fn what(setting: Setting) -> What {
+        What {
+            kind: Kind::Video,
+            setting,
+            network: Network::Lan,
+            length: Length {
+                settle: 1,
+                counted: 2,
+            },
+        }
+    }
+
+    fn sent(bytes: f64, response: f64) -> Measured<Sent> {
+        Measured::Done(Sent {
+            responses: vec![response; 2],
+            carried: Some([bytes, 10.0]),
+            each: vec![bytes as u64, 1000],
+            ..Sent::default()
+        })
+    }
+
+    fn runs() -> Runs {
+        let received = Received {
+            psnr: vec![36.0, 38.0],
+            exact: 1,
+        };
+        let made = |codec: &str, bytes: u64| Made {
+            codec: codec.to_owned(),
+            ours: codec == "image",
+            bytes: [200, bytes],
+        };
+        let alone = Alone {
+            codecs: vec![made("deflate", 150), made("image", 160)],
+            known: None,
+        };
+        Runs {
+            streams: vec![
+                (what(Setting::None), sent(1000.0, 0.08)),
+                (what(Setting::Auto), sent(500.0, 0.09)),
+                (what(Setting::Jpeg), sent(50.0, 0.02)),
+            ],
+            received: vec![(what(Setting::Jpeg), Measured::Done(received))],
+            alone: vec![(Kind::Video, Measured::Done(alone))],
+            quick: false,
+        }
+    }
+
+    #[test]
+    fn savings_are_beside_the_published_ones() {
+        let section = section(&runs()).expect("a section");
+        let rows = &section.tables[0].rows;
+        assert_eq!(rows[0][4], "the base");
+        assert_eq!(rows[1][3..5], ["75.4 %", "50.0 %"].map(str::to_owned));
+        assert_eq!(rows[2][4], "95.0 %");
+        assert_eq!(
+            rows[2][7..],
+            ["1 of 2", "37.0 (36.0)", "2 of 3"].map(str::to_owned)
+        );
+        assert_eq!(section.tables[2].rows[0][4], "25.00 %");
+        let told = section.findings.join(" ");
+        assert!(told.contains("25.4 percentage points less"), "{told}");
+        assert!(told.contains("at least as many as"), "{told}");
+        assert!(
+            told.contains("takes longer with the codec (90.0 ms)"),
+            "{told}"
+        );
+        assert!(told.contains("1 of 2 messages went as they are"), "{told}");
+        assert!(
+            told.contains("image makes 160 bytes of a message where deflate makes 150"),
+            "{told}"
+        );
+        assert!(section.missing.is_empty(), "{:?}", section.missing);
+    }
+
+    #[test]
+    fn a_codec_that_is_not_built_in_is_missing() {
+        let lacks = Sent {
+            warning: Some("codec = \"video\" is not built into this stub".to_owned()),
+            carried: Some([1.0, 1.0]),
+            ..Sent::default()
+        };
+        let mut runs = runs();
+        let what = what(Setting::Video);
+        runs.streams.push((what, Measured::Done(lacks)));
+        let section = section(&runs).expect("a section");
+        assert_eq!(section.tables[0].rows.len(), 3);
+        assert!(section.missing[0].why.contains("not built"));
+        assert!(section.missing[0].next.contains("feature video"));
+    }
+
+    #[test]
+    fn a_stream_without_its_base_saves_nothing_known() {
+        let mut runs = runs();
+        runs.streams[0].1 = Measured::Missing("the place was killed".to_owned());
+        let section = section(&runs).expect("a section");
+        assert_eq!(section.tables[0].rows[0][4], "–");
+        assert!(section.missing[0].why.contains("killed"));
+    }
+}
