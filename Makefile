@@ -167,7 +167,7 @@ bench: test-deps build ## every measurement with its peer in the same run; ONLY=
 	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
 
 # What the evaluation runs beside its own experiments.
-EVAL_BENCHES := failover choreographer servant portal link
+EVAL_BENCHES := failover servant portal link
 
 .PHONY: eval
 ifneq ($(QUICK),)

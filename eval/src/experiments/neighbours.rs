@@ -28,8 +28,8 @@ pub fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
 /// What the report says.
 pub fn section(runs: &Runs) -> Result<Section> {
     let mut section = Section::new(9, "neighbours", "Robots beside each other");
-    section.published = "In the publication each robot has a container of its own, so that robots do not disturb each other; no figure of \
-                         it is given."
+    section.published = "Robots have servants of their own in the publication, which are isolated from one another; no published figure is \
+                         repeated here."
         .to_owned();
     section.differs = vec![
         "The services compute for a known time of a core at each call (eval/packages/worker_cpp), so that what is beyond it is waiting. \

@@ -62,7 +62,7 @@ impl Had {
 pub(super) struct Runs(Vec<(Plan, Measured<Vec<Had>>)>);
 
 pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
-    let robots: &[usize] = if quick { &[2] } else { &[2, 4, 8] };
+    let robots: &[usize] = if quick { &[4] } else { &[2, 4, 8] };
     // The controller looks once a second and moves cores in steps.
     let (settles, lasts) = if quick { (1.0, 1.5) } else { (8.0, 9.0) };
     let mut runs = Vec::new();

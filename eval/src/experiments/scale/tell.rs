@@ -1,4 +1,6 @@
-//! What the report says of the points, and of the queue that is fitted to a part of them.
+//! What the report says of the points.
+
+mod model;
 
 use anyhow::Result;
 
@@ -10,16 +12,12 @@ use crate::section::{Missing, Section, Table};
 use crate::statistics::{Node, Observed, mean, median, quantile};
 use crate::words::{digits, milliseconds, ratio};
 
-/// The mean response time that robots accept where nodes are counted, seconds.
-const T_MAX: f64 = 0.1;
-/// Numbers of robots for which nodes are counted.
-const MANY: [u64; 2] = [1_000, 100_000];
 /// How many times as long as alone the median is where the curve counts as bent.
 const BENT: f64 = 2.0;
 /// From this share on, a resource counts as used up.
 const FULL: f64 = 0.85;
-/// Part of a node's memory that servants may have, as the daemon's default.
-const MEMORY_PART: f64 = 0.9;
+/// From this share of the cores' time on, others disturb the run.
+const OTHERS: f64 = 0.25;
 const MEGA: f64 = 1e6;
 
 /// A point, with what it is for.
@@ -56,8 +54,14 @@ impl Told<'_> {
         cores * self.point.lasted / self.point.times.len() as f64 * 1e3
     }
 
+    /// The share of the cores' time that was used.
     fn busy(&self) -> f64 {
         self.point.used.machine / self.plan.cores
+    }
+
+    /// The same of what requests did not use: other programs, and the kernel where it works for nobody.
+    fn others(&self) -> f64 {
+        (self.point.used.machine - self.point.used.requests()) / self.plan.cores
     }
 }
 
@@ -99,8 +103,9 @@ pub fn section(runs: &Runs) -> Result<Section> {
     points(&told, node.as_ref(), &mut section);
     costs(&told, &mut section)?;
     bend(&told, node.as_ref(), &mut section);
+    disturbed(&told, &mut section);
     match &node {
-        Some(node) => model(&told, node, &mut section)?,
+        Some(node) => model::tell(&told, node, &mut section)?,
         None => section.missing.push(Missing::new(
             "the queueing model",
             "fewer than two of the points that determine it were measured",
@@ -263,6 +268,11 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
             ratio(times[times.len() - 1].map(|time| time / alone)),
             told[0].plan.robots,
         )
+    } else if at.busy() >= FULL && at.others() >= OTHERS {
+        format!(
+            "At {robots} robots the median is {BENT} times that alone or more, but other programs used {:.0} % of the cores' time: {state}.{knee}",
+            at.others() * 100.0
+        )
     } else if at.busy() >= FULL {
         format!(
             "At {robots} robots the median is {BENT} times that alone or more, because the processor is used up: {state}; {room}.{knee}"
@@ -279,126 +289,14 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
     });
 }
 
-fn model(told: &[Told], node: &Node, section: &mut Section) -> Result<()> {
-    let most = told.iter().map(|one| one.plan.robots).max().unwrap_or(1);
-    let curve = (1..=most as u64).map(|robots| (robots as f64, node.at(robots).response * 1e3));
-    let measured = |held_back: bool| -> Vec<(f64, f64)> {
-        let some = told.iter().filter(|one| one.held_back == held_back);
-        some.filter_map(|one| Some((one.robots(), one.mean()? * 1e3)))
-            .collect()
-    };
-    let caption = "Mean response time by robots, and the queue that was fitted";
-    let drawing = plots::curves(
-        caption,
-        "robots",
-        "mean response time (ms)",
-        &[Series::new("model", curve.collect())],
-        &[
-            Series::new("measured, the model was fitted to", measured(false)),
-            Series::new("measured, held back", measured(true)),
-        ],
-        false,
-    )?;
-    section.drawing("scale-model", caption, drawing);
-    section.findings.push(format!(
-        "A closed queue (machine repair, M/M/c//N) of {} cores, with {} ms of a core and {} ms of other waiting for each request and {} \
-         ms of pause, predicts {}.",
-        node.cores,
-        digits(node.service * 1e3),
-        digits(node.delay * 1e3),
-        digits(node.think * 1e3),
-        error_of(told, node)
-    ));
-    nodes(told, node, section);
-    Ok(())
-}
-
-/// How far the model is off where it was not fitted.
-fn error_of(told: &[Told], node: &Node) -> String {
-    let held_back = told.iter().filter(|one| one.held_back);
-    let errors: Vec<(usize, f64)> = held_back
-        .filter_map(|one| {
-            let predicted = node.at(one.plan.robots as u64).response;
-            Some((one.plan.robots, (predicted / one.mean()? - 1.0) * 100.0))
-        })
-        .collect();
-    let sizes: Vec<f64> = errors.iter().map(|error| error.1.abs()).collect();
-    let (Some(mean), Some(most)) = (mean(&sizes), quantile(&sizes, 1.0)) else {
-        return "what was not checked: no point that was held back was measured".to_owned();
-    };
-    let each: Vec<String> = errors
-        .iter()
-        .map(|(robots, error)| format!("{error:+.1} % at {robots}"))
-        .collect();
-    format!(
-        "the mean response times that were held back within {mean:.1} % on average, {most:.1} % at most ({})",
-        each.join(", ")
-    )
-}
-
-/// Nodes like this one that more robots need.
-fn nodes(told: &[Told], node: &Node, section: &mut Section) {
-    let last = &told[told.len() - 1];
-    // Robots are elsewhere then.
-    let beside = last.point.used.robots / last.point.used.requests();
-    let alone = Node {
-        service: node.service * (1.0 - beside),
-        ..*node
-    };
-    let memory = (MEMORY_PART * last.point.left.1 / last.memory()) as u64;
-    let admits = last.point.admits;
-    let caption = format!(
-        "Nodes like this one ({} cores, {:.0} GB) for a mean response time of {:.0} ms at most",
-        node.cores,
-        last.point.left.1 / 1e9,
-        T_MAX * 1e3
-    );
-    let mut table = Table::new(
-        caption,
-        [
-            "robots",
-            "robots per node by the model",
-            "by memory",
-            "by what the daemon reserves",
-            "nodes needed",
-        ],
-    );
-    for robots in MANY {
-        let served = alone.serves(robots, T_MAX);
-        let each = served.min(memory).min(admits);
-        let needed = if each == 0 {
-            "no number is enough".to_owned()
-        } else {
-            robots.div_ceil(each).to_string()
-        };
-        table.push([
-            robots.to_string(),
-            served.to_string(),
-            memory.to_string(),
-            admits.to_string(),
-            needed.clone(),
-        ]);
+/// Figures of a machine that was not quiet are said to be such.
+fn disturbed(told: &[Told], section: &mut Section) {
+    let most = told.iter().map(Told::others).fold(0.0, f64::max);
+    if most >= OTHERS {
         section.findings.push(format!(
-            "{robots} such robots need {needed} nodes like this one for {:.0} ms at most on average: {}.",
-            T_MAX * 1e3,
-            match each {
-                0 => "even one robot alone waits longer".to_owned(),
-                each if each == served => format!("its processor serves {each} each"),
-                each if each == memory => format!("its memory has room for {each} each"),
-                each => format!("its daemon makes room for {each} each, although its processor would serve {served}"),
-            }
-        ));
-    }
-    section.tables.push(table);
-    section.differs.push(format!(
-        "Nodes are counted without the robots' own part of the processor ({:.0} % here), without a network, and as if robots were spread \
-         evenly: what a machine that spreads them would take is not in it.",
-        beside * 100.0
-    ));
-    if last.busy() < FULL {
-        section.differs.push(format!(
-            "The cores were at most {:.0} % busy in this run: what the model says of more robots was not checked.",
-            last.busy() * 100.0
+            "Other programs used up to {:.0} % of the cores' time meanwhile: response times, the memory that the machine has less and \
+             the model's error are worse than on a quiet machine. make eval ONLY=10 FRESH=1 measures again.",
+            most * 100.0
         ));
     }
 }

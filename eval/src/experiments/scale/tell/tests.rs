@@ -99,6 +99,32 @@ fn the_bend_and_its_reason_are_told() {
 }
 
 #[test]
+fn a_machine_that_is_not_quiet_is_told_of() {
+    let all = [1, 2, 4, 8, 16, 32, 64, 100];
+    let quiet = told(&all);
+    assert!(
+        !quiet
+            .findings
+            .iter()
+            .any(|words| words.contains("Other programs"))
+    );
+    let mut runs = Runs(all.map(measured).into());
+    for (_, measured) in &mut runs.0 {
+        let Measured::Done(point) = measured else {
+            continue;
+        };
+        point.used.machine = 2.0;
+        point
+            .times
+            .iter_mut()
+            .for_each(|time| *time *= 1.0 + point.starts[0].0 as f64 / 10.0);
+    }
+    let section = section(&runs).expect("it is told");
+    assert!(finding(&section, "times that alone").contains("but other programs used"));
+    assert!(finding(&section, "Other programs used up to 9").contains("FRESH=1"));
+}
+
+#[test]
 fn what_is_missing_is_named_and_the_rest_is_told() {
     let mut runs = Runs([1, 2, 4].map(measured).into());
     runs.0[2].1 = Measured::Missing("no room".to_owned());
