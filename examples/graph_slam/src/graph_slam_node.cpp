@@ -17,7 +17,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
+#include <map>
 #include <memory>
 #include <optional>
 #include <string>
@@ -85,6 +87,7 @@ class GraphSlam {
         iterations_(private_.param("iterations", 10)),
         render_every_(std::max(1, private_.param("render_every", 1))),
         odom_wait_(private_.param("odom_wait", 0.25)),
+        odom_slack_(private_.param("odom_slack", 0.05)),
         grid_(-10.0F, 10.0F, -10.0F, 10.0F, static_cast<float>(private_.param("resolution", 0.05))) {
     grid_.insertionOptions.maxDistanceInsertion = static_cast<float>(max_range_);
     grid_.insertionOptions.considerInvalidRangesAsFreeSpace = false;
@@ -115,12 +118,16 @@ class GraphSlam {
     CSimplePointsMap points;
   };
 
+  static constexpr size_t kOdoms = 200;
+
   void odomReceived(const nav_msgs::Odometry::ConstPtr& msg) {
     const auto& p = msg->pose.pose;
     const Pose odom(p.position.x, p.position.y, yawOf(p.orientation));
     if (!odom.allFinite()) return;
-    odom_ = odom;
-    odom_is_new_ = true;
+    // A recording that is played anew begins with earlier stamps.
+    if (!odoms_.empty() && msg->header.stamp + ros::Duration(10.0) < odoms_.rbegin()->first) odoms_.clear();
+    odoms_[msg->header.stamp] = odom;
+    if (odoms_.size() > kOdoms) odoms_.erase(odoms_.begin());
   }
 
   void scanReceived(const sensor_msgs::LaserScan::ConstPtr& msg) {
@@ -128,10 +135,20 @@ class GraphSlam {
     scan_received_ = WallTime::now();
   }
 
-  // Scan and odometry come on connections of their own: either may be a little earlier.
+  // Scan and odometry come on connections of their own, in any order: what belongs together is told by the stamps.
   bool odometryIsThere() const {
-    return odom_is_new_ || odom_sub_.getNumPublishers() == 0 ||
-           (WallTime::now() - scan_received_).toSec() >= odom_wait_;
+    const bool there = !odoms_.empty() && odoms_.rbegin()->first + odom_slack_ >= scan_->header.stamp;
+    return there || odom_sub_.getNumPublishers() == 0 || (WallTime::now() - scan_received_).toSec() >= odom_wait_;
+  }
+
+  // What was measured nearest to the scan.
+  std::optional<Pose> odometry() const {
+    if (odoms_.empty()) return std::nullopt;
+    const ros::Time at = scan_->header.stamp;
+    auto nearest = odoms_.lower_bound(at);
+    if (nearest == odoms_.end()) return std::prev(nearest)->second;
+    if (nearest != odoms_.begin() && at - std::prev(nearest)->first < nearest->first - at) --nearest;
+    return nearest->second;
   }
 
   void process() {
@@ -142,9 +159,9 @@ class GraphSlam {
     const WallTime acquired = WallTime::now();
 
     Pose moved = Pose::Zero();
-    if (odom_ && odom_before_) moved = graph_slam::between(*odom_before_, *odom_);
-    if (odom_) odom_before_ = odom_;
-    odom_is_new_ = false;
+    const std::optional<Pose> odom = odometry();
+    if (odom && odom_before_) moved = graph_slam::between(*odom_before_, *odom);
+    if (odom) odom_before_ = odom;
     nodes_.push_back(std::move(node));
     connect(moved);
     graph_.optimize(iterations_);
@@ -259,15 +276,15 @@ class GraphSlam {
   const int iterations_;
   const int render_every_;
   const double odom_wait_;
+  const ros::Duration odom_slack_;
   const Occupancy occupancy_;
 
   graph_slam::PoseGraph graph_;
   std::vector<std::unique_ptr<Node>> nodes_;
   COccupancyGridMap2D grid_;
 
-  std::optional<Pose> odom_;
+  std::map<ros::Time, Pose> odoms_;  // the latest
   std::optional<Pose> odom_before_;  // at the scan before
-  bool odom_is_new_ = false;
   sensor_msgs::LaserScan::ConstPtr scan_;  // to be worked on
   WallTime scan_received_;
 

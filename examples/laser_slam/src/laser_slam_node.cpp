@@ -15,7 +15,9 @@
 #include <sensor_msgs/LaserScan.h>
 
 #include <cmath>
+#include <iterator>
 #include <limits>
+#include <map>
 #include <optional>
 #include <string>
 #include <vector>
@@ -74,6 +76,7 @@ class LaserSlam {
         min_score_(private_.param("min_score", 0.3)),
         render_every_(std::max(1, private_.param("render_every", 1))),
         odom_wait_(private_.param("odom_wait", 0.25)),
+        odom_slack_(private_.param("odom_slack", 0.05)),
         matcher_(window(), std::max(1, private_.param("refined", 5))),
         grid_(-10.0F, 10.0F, -10.0F, 10.0F, static_cast<float>(private_.param("resolution", 0.05))) {
     grid_.insertionOptions.maxDistanceInsertion = static_cast<float>(max_range_);
@@ -108,12 +111,16 @@ class LaserSlam {
     return window;
   }
 
+  static constexpr size_t kOdoms = 200;
+
   void odomReceived(const nav_msgs::Odometry::ConstPtr& msg) {
     const auto& p = msg->pose.pose;
     const CPose2D odom(p.position.x, p.position.y, yawOf(p.orientation));
     if (!std::isfinite(odom.x() + odom.y() + odom.phi())) return;
-    odom_ = odom;
-    odom_is_new_ = true;
+    // A recording that is played anew begins with earlier stamps.
+    if (!odoms_.empty() && msg->header.stamp + ros::Duration(10.0) < odoms_.rbegin()->first) odoms_.clear();
+    odoms_[msg->header.stamp] = odom;
+    if (odoms_.size() > kOdoms) odoms_.erase(odoms_.begin());
   }
 
   void scanReceived(const sensor_msgs::LaserScan::ConstPtr& msg) {
@@ -121,10 +128,20 @@ class LaserSlam {
     scan_received_ = WallTime::now();
   }
 
-  // Scan and odometry come on connections of their own: either may be a little earlier.
+  // Scan and odometry come on connections of their own, in any order: what belongs together is told by the stamps.
   bool odometryIsThere() const {
-    return odom_is_new_ || odom_sub_.getNumPublishers() == 0 ||
-           (WallTime::now() - scan_received_).toSec() >= odom_wait_;
+    const bool there = !odoms_.empty() && odoms_.rbegin()->first + odom_slack_ >= scan_->header.stamp;
+    return there || odom_sub_.getNumPublishers() == 0 || (WallTime::now() - scan_received_).toSec() >= odom_wait_;
+  }
+
+  // What was measured nearest to the scan.
+  std::optional<CPose2D> odometry() const {
+    if (odoms_.empty()) return std::nullopt;
+    const ros::Time at = scan_->header.stamp;
+    auto nearest = odoms_.lower_bound(at);
+    if (nearest == odoms_.end()) return std::prev(nearest)->second;
+    if (nearest != odoms_.begin() && at - std::prev(nearest)->first < nearest->first - at) --nearest;
+    return nearest->second;
   }
 
   void process() {
@@ -135,9 +152,9 @@ class LaserSlam {
     const WallTime acquired = WallTime::now();
 
     CPose2D guess = pose_;
-    if (odom_ && odom_before_) guess = pose_ + (*odom_ - *odom_before_);
-    if (odom_) odom_before_ = odom_;
-    odom_is_new_ = false;
+    const std::optional<CPose2D> odom = odometry();
+    if (odom && odom_before_) guess = pose_ + (*odom - *odom_before_);
+    if (odom) odom_before_ = odom;
     pose_ = guess;
     if (!points.empty()) {
       bool fits = true;
@@ -234,6 +251,7 @@ class LaserSlam {
   const double min_score_;
   const int render_every_;
   const double odom_wait_;
+  const ros::Duration odom_slack_;
   const laser_slam::ScanMatcher matcher_;
   const Occupancy occupancy_;
 
@@ -242,9 +260,8 @@ class LaserSlam {
   CPose2D pose_;
   long scans_ = 0;
 
-  std::optional<CPose2D> odom_;
+  std::map<ros::Time, CPose2D> odoms_;  // the latest
   std::optional<CPose2D> odom_before_;  // at the scan before
-  bool odom_is_new_ = false;
   sensor_msgs::LaserScan::ConstPtr scan_;  // to be worked on
   WallTime scan_received_;
 
