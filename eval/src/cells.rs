@@ -3,15 +3,21 @@
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
+use std::time::Instant;
 
 use anyhow::{Context, Result};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::interrupt;
+
 /// Runs that were measured.
 pub struct Cells {
     directory: PathBuf,
+    /// What all of them depend on.
+    basis: String,
+    begun: Instant,
 }
 
 /// One run.
@@ -53,7 +59,23 @@ impl Cells {
             }
         }
         std::fs::create_dir_all(&directory).with_context(|| directory.display().to_string())?;
-        Ok(Self { directory })
+        Ok(Self {
+            directory,
+            basis: String::new(),
+            begun: Instant::now(),
+        })
+    }
+
+    /// Runs that were measured with another `basis` are measured anew.
+    pub fn based_on(mut self, basis: String) -> Self {
+        self.basis = basis;
+        self
+    }
+
+    /// Says how a run goes, with the time since the evaluation's beginning.
+    fn tell(&self, words: &str) {
+        let seconds = self.begun.elapsed().as_secs();
+        eprintln!("{:3}:{:02}  {words}", seconds / 60, seconds % 60);
     }
 
     /// The run of this name, measured unless that was done before. What cannot be measured is told, and tried again the next time.
@@ -63,14 +85,17 @@ impl Cells {
         of: &impl Serialize,
         run: impl FnOnce() -> Result<T>,
     ) -> Result<Measured<T>> {
-        let of = serde_json::to_value(of)?;
+        let of = serde_json::to_value((&self.basis, of))?;
         if let Some(measured) = self.known(name, &of) {
-            eprintln!("{name}: measured before");
+            self.tell(&format!("{name}: measured before"));
             return Ok(Measured::Done(measured));
         }
-        eprintln!("{name}");
-        match run() {
+        self.tell(name);
+        let begun = Instant::now();
+        match interrupt::none().and_then(|()| run()) {
             Ok(measured) => {
+                let took = begun.elapsed().as_secs_f64();
+                self.tell(&format!("{name}: {took:.0} s"));
                 let cell = Cell {
                     of,
                     measured: serde_json::to_value(&measured)?,
@@ -79,7 +104,7 @@ impl Cells {
                 Ok(Measured::Done(measured))
             }
             Err(error) => {
-                eprintln!("{name}: not measured: {error:#}");
+                self.tell(&format!("{name}: not measured: {error:#}"));
                 Ok(Measured::Missing(format!("{error:#}")))
             }
         }
@@ -143,6 +168,16 @@ mod tests {
         cells.measure("a", &1, || Ok(41)).expect("it is kept");
         let other = cells.measure("a", &2, || Ok(42)).expect("it is kept");
         assert_eq!(other.done(), Some(&42));
+    }
+
+    #[test]
+    fn another_basis_is_measured_anew() {
+        let (place, cells) = cells();
+        cells.measure("a", &1, || Ok(41)).expect("it is kept");
+        let later = Cells::new(place.path().join("cells"), false).expect("a directory");
+        let later = later.based_on("other packages".to_owned());
+        let anew = later.measure("a", &1, || Ok(42)).expect("it is kept");
+        assert_eq!(anew.done(), Some(&42));
     }
 
     #[test]

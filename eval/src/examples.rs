@@ -4,12 +4,14 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result, ensure};
+use sha2::{Digest, Sha256};
 use support::binaries;
 use support::daemon::Daemon;
 use support::site::{image_config, in_image};
 use tempfile::TempDir;
 
 use crate::robot::{Node, Pace, Plan};
+use crate::weights;
 
 /// Where packages that were compiled are, in images.
 const INSTALLED: &str = "/opt/cloudroid/install/lib";
@@ -21,6 +23,9 @@ const BAG: &str = "recording.bag";
 const DATA: &str = "/usr/share/mrpt/datasets";
 /// A real drive of 76 m through a floor of a faculty, with a SICK laser.
 const DRIVE: &str = "2006-01ENE-21-SENA_Telecom Faculty_one_loop_only.rawlog";
+
+/// Pedestrians, of Debian's opencv-doc.
+const VIDEO: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
 /// A package below `examples/`, and what it speaks.
 #[derive(Debug, Clone, Copy)]
@@ -54,6 +59,25 @@ pub enum Input {
     Drive,
     /// Pedestrians.
     Pictures,
+}
+
+impl Input {
+    /// Whether the files that it is made of are there, so that nothing is built for a recording that cannot be had.
+    ///
+    /// # Errors
+    /// Says which is missing, and which package brings it.
+    pub fn is_there(self) -> Result<()> {
+        let (file, package) = match self {
+            Self::Drive => (Path::new(DATA).join(DRIVE), "mrpt-common"),
+            Self::Pictures => (PathBuf::from(VIDEO), "opencv-doc"),
+        };
+        ensure!(
+            file.exists(),
+            "{} is missing; it comes with Debian's {package}: apt-get install {package}",
+            file.display()
+        );
+        Ok(())
+    }
 }
 
 /// Scans are matched with the map that was made of those before.
@@ -136,9 +160,10 @@ impl<'a> Workshop<'a> {
             "pushing {}: the first time takes some minutes",
             example.name
         );
+        example.input.is_there()?;
         let package = binaries::checkout().join("examples").join(example.name);
         if example.name == DETECTOR.name {
-            fetch_weights(&package)?;
+            weights::put_into(&package)?;
         }
         let package = package.to_str().context("a path of UTF-8")?;
         let push = [
@@ -204,6 +229,10 @@ impl<'a> Workshop<'a> {
             recording: self.recording(example.input)?,
             request: example.request.to_owned(),
             left_out: vec!["/ground_truth".to_owned()],
+            besides: match example.input {
+                Input::Drive => vec!["/odom".to_owned()],
+                Input::Pictures => Vec::new(),
+            },
             answer: example.answer.to_owned(),
             tells_pose: example.input == Input::Drive,
             timing: Some(example.timing.to_owned()),
@@ -241,10 +270,6 @@ impl<'a> Workshop<'a> {
         let root = directory.path().join("root");
         let script = in_image(self.daemon, LASER_SLAM.name, &root)?;
         let program = format!("{INSTALLED}/{}/rawlog_to_bag", LASER_SLAM.name);
-        ensure!(
-            Path::new(DATA).join(DRIVE).exists(),
-            "{DATA}/{DRIVE} is missing; it comes with Debian's mrpt-common: scripts/deps eval"
-        );
         // What the converter reads and writes is on this machine.
         let bind = format!(
             "mount --bind {} {root}/mnt && mount --bind {DATA} {root}/media && exec chroot",
@@ -266,29 +291,36 @@ impl<'a> Workshop<'a> {
     }
 }
 
-/// Gets what the detector has learned, unless it is there.
-fn fetch_weights(package: &Path) -> Result<()> {
-    if package.join("models/centernet.onnx").exists() {
-        return Ok(());
+/// What the packages are made of (SHA-256), so that runs of other ones are not taken for runs of these.
+pub fn fingerprint() -> Result<String> {
+    let mut files = Vec::new();
+    let mut pending = vec![binaries::checkout().join("examples")];
+    while let Some(directory) = pending.pop() {
+        for entry in std::fs::read_dir(&directory)? {
+            let path = entry?.path();
+            if path.is_dir() {
+                pending.push(path);
+            } else if path.extension().is_none_or(|ending| ending != "md") {
+                files.push(path);
+            }
+        }
     }
-    let status = Command::new(package.join("fetch_weights")).status()?;
-    ensure!(
-        status.success(),
-        "the detector's weights could not be fetched ({status}): {}/fetch_weights",
-        package.display()
-    );
-    Ok(())
+    files.sort();
+    let mut whole = Sha256::new();
+    for file in files {
+        // The weights are checked where they are fetched.
+        if file.extension().is_none_or(|ending| ending != "onnx") {
+            whole.update(file.to_string_lossy().as_bytes());
+            whole.update(std::fs::read(&file)?);
+        }
+    }
+    Ok(format!("{:x}", whole.finalize()))
 }
 
 /// Pedestrians of opencv-doc, 640x480, bgr8, one after the other.
 fn pictures(to: &Path) -> Result<()> {
-    let video = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
-    ensure!(
-        Path::new(video).exists(),
-        "{video} is missing; it comes with Debian's opencv-doc: make deps"
-    );
     let status = Command::new("ffmpeg")
-        .args(["-v", "error", "-i", video, "-vf", "scale=640:480"])
+        .args(["-v", "error", "-i", VIDEO, "-vf", "scale=640:480"])
         .args([
             "-frames:v",
             "60",

@@ -10,17 +10,23 @@
 
 #![forbid(unsafe_code)]
 
+pub mod application;
 pub mod cells;
+pub mod estimate;
 pub mod examples;
 pub mod experiments;
+pub mod interrupt;
 pub mod page;
 pub mod place;
 pub mod plots;
 pub mod recording;
+pub mod rehearsal;
 pub mod report;
 pub mod robot;
 pub mod section;
 pub mod statistics;
 pub mod stream;
+pub mod sweep;
 pub mod trace;
+mod weights;
 pub mod words;

@@ -16,7 +16,7 @@ use eval::experiments::{
     codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
 };
 use eval::section::Section;
-use eval::{report, robot};
+use eval::{estimate, examples, interrupt, rehearsal, report, robot, sweep};
 
 /// Requests of each run of a quick evaluation.
 const QUICK: usize = 10;
@@ -33,6 +33,9 @@ struct Arguments {
     /// Measure again what was measured before.
     #[arg(long)]
     fresh: bool,
+    /// Where the report is written, and what was measured is kept; without it below the checkout's `target`.
+    #[arg(long, global = true, value_name = "DIRECTORY")]
+    target: Option<PathBuf>,
     #[command(subcommand)]
     verb: Option<Verb>,
 }
@@ -47,13 +50,19 @@ enum Verb {
         /// Where what it saw is written.
         answer: PathBuf,
     },
+    /// An evaluation of nothing, for tests.
+    #[command(hide = true)]
+    Rehearse {
+        /// How long its node is there.
+        seconds: f64,
+    },
 }
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let done = match &arguments.verb {
         Some(Verb::Robot { order, answer }) => robot::main(order, answer).map(|()| true),
-        None => evaluate(&arguments),
+        _ => evaluate(&arguments),
     };
     match done {
         Ok(true) => ExitCode::SUCCESS,
@@ -71,20 +80,33 @@ fn evaluate(arguments: &Arguments) -> Result<bool> {
         nix::unistd::geteuid().is_root(),
         "robots' places and servants are made by root: sudo make eval"
     );
-    let target = bench_report::root()
-        .join("target")
-        .join(if arguments.quick {
+    let target = arguments.target.clone().unwrap_or_else(|| {
+        let name = if arguments.quick {
             "eval-quick"
         } else {
             "eval"
-        });
+        };
+        bench_report::root().join("target").join(name)
+    });
     let cells = Cells::new(target.join("cells"), arguments.fresh)?;
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-eval-")
-        .tempdir()?;
+    let cells = cells.based_on(examples::fingerprint()?);
+    interrupt::listen()?;
+    for line in sweep::all() {
+        eprintln!("left by an evaluation before: {line}");
+    }
+    let place = tempfile::Builder::new().prefix(sweep::PREFIX).tempdir()?;
+    sweep::claim(place.path())?;
     let daemon = Setup::new(&place.path().join("home")).start()?;
     let workshop = Workshop::new(&daemon, place.path());
-    let sections = sections(arguments, &cells, &workshop)?;
+    let sections = match &arguments.verb {
+        Some(Verb::Rehearse { seconds }) => {
+            vec![rehearsal::section(&cells, &workshop, *seconds)?]
+        }
+        _ => {
+            estimate::tell(arguments.quick, &arguments.only);
+            sections(arguments, &cells, &workshop)?
+        }
+    };
     daemon.ends()?;
     report::write(&target, &sections)
 }
@@ -141,9 +163,21 @@ fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result
             sections.push(scale::section(&runs)?);
         }
     }
+    if arguments.quick && wanted(11) {
+        sections.push(later(11, "overhead", "What the system itself adds"));
+    }
     if !arguments.quick && wanted(11) {
         sections.push(overhead::section(&overhead::measure(cells)?)?);
     }
     sections.sort_by_key(|section| section.number);
     Ok(sections)
+}
+
+/// An experiment that a quick evaluation leaves out.
+fn later(number: u8, id: &str, title: &str) -> Section {
+    let mut section = Section::new(number, id, title);
+    section
+        .findings
+        .push("A quick evaluation leaves this out; make eval measures it.".to_owned());
+    section
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -18,6 +18,7 @@ use support::cable::{Badness, Cable};
 
 use crate::robot::Plan;
 use crate::trace::Trace;
+use crate::{interrupt, sweep};
 
 /// How long the kernel may take to end what runs in a place.
 const END: Duration = Duration::from_secs(20);
@@ -117,6 +118,8 @@ pub struct Place {
     /// Where the server is reached from inside.
     cable: Cable,
     cgroup: Cgroup,
+    /// What runs in it: this very program, unless a test says otherwise.
+    pub program: PathBuf,
 }
 
 impl Place {
@@ -124,7 +127,7 @@ impl Place {
     pub fn new(portal: &str, class: Class, network: Network) -> Result<Self> {
         let cable = Cable::with_robot_inside(portal).context("the robot's network")?;
         cable.degrade(network.rules())?;
-        let parent = Parent::find()?;
+        let parent = Parent::find().context("control groups, which a robot's place needs")?;
         ensure!(
             parent.version != 0,
             "no control groups can be made here ({}): a robot's place needs their limits; run it as root where they are delegated",
@@ -139,7 +142,12 @@ impl Place {
         let name = name.file_name().and_then(|name| name.to_str());
         let cgroup = Cgroup::planned(&parent, &spec(name.unwrap_or("robot"), &limits));
         cgroup.create()?;
-        let place = Self { cable, cgroup };
+        let place = Self {
+            cable,
+            cgroup,
+            // By the process: the file may have been replaced meanwhile.
+            program: format!("/proc/{}/exe", std::process::id()).into(),
+        };
         let now = place.cgroup.set(&limits).limits;
         let cores = now.cpus.unwrap_or(f64::INFINITY);
         ensure!(
@@ -181,7 +189,7 @@ impl Place {
         let mut child = Command::new("nsenter")
             .arg(format!("--net={}", self.cable.namespace().display()))
             .arg("--")
-            .arg(std::env::current_exe()?)
+            .arg(&self.program)
             .arg("robot")
             .args([&order, &answer])
             // What a robot that is killed leaves goes with the run's directory.
@@ -266,11 +274,51 @@ impl Drop for Place {
     }
 }
 
+/// Takes away places of processes that are no more; tells which, each in a line.
+pub fn sweep() -> Vec<String> {
+    let Ok(parent) = Parent::find() else {
+        return Vec::new();
+    };
+    let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
+    let names = entries
+        .flatten()
+        .filter_map(|entry| entry.file_name().into_string().ok());
+    let mut told = Vec::new();
+    for name in names {
+        let Some((pid, number)) = owner(&name) else {
+            continue;
+        };
+        if Path::new(&format!("/proc/{pid}")).exists() {
+            continue;
+        }
+        let cgroup = Cgroup::planned(&parent, &spec(&name, &Limits::default()));
+        if let Err(error) = cgroup.destroy(END) {
+            told.push(format!("the robot's place {name} is left: {error}"));
+            continue;
+        }
+        sweep::ip(&["link", "del", &format!("cr{pid}-{number}")]);
+        sweep::ip(&["netns", "del", &name]);
+        told.push(format!("the robot's place {name}: taken away"));
+    }
+    told
+}
+
+/// Of which process a namespace is, by its name, and its number there.
+fn owner(name: &str) -> Option<(u32, u32)> {
+    let (pid, number) = name.strip_prefix("cloudroid-cable-")?.split_once('-')?;
+    Some((pid.parse().ok()?, number.parse().ok()?))
+}
+
 fn waits(child: &mut Child, patience: Duration) -> Result<()> {
     let deadline = Instant::now() + patience;
     let status = loop {
         if let Some(status) = child.try_wait()? {
             break status;
+        }
+        if interrupt::asked() {
+            let _ = child.kill();
+            let _ = child.wait();
+            bail!("the evaluation was asked to end while this was measured");
         }
         if Instant::now() > deadline {
             let _ = child.kill();
@@ -333,6 +381,13 @@ mod tests {
         let error = waits(&mut child, Duration::ZERO).expect_err("it takes a minute");
         assert!(error.to_string().contains("not done"), "{error}");
         assert!(child.try_wait().expect("it was waited for").is_some());
+    }
+
+    #[test]
+    fn a_place_is_of_the_process_in_its_name() {
+        assert_eq!(owner("cloudroid-cable-12-3"), Some((12, 3)));
+        assert_eq!(owner("cloudroid-cable-12"), None);
+        assert_eq!(owner("somebody's-12-3"), None);
     }
 
     #[test]

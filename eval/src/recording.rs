@@ -13,6 +13,7 @@ use crate::stream;
 const SIZE: (u32, u32) = (640, 480);
 /// Between two pictures, nanoseconds.
 const PERIOD: u64 = 100_000_000;
+const SECOND: u64 = 1_000_000_000;
 
 /// A recording.
 #[derive(Debug, Clone)]
@@ -156,10 +157,31 @@ pub fn numbers(bytes: &[u8], from: usize, count: usize) -> Option<Vec<f64>> {
 
 /// A message whose header's stamp is `number` seconds, so that its answer can be told from others.
 pub fn restamped(bytes: &Bytes, number: u32) -> Option<Bytes> {
+    stamped_at(bytes, (number, 0))
+}
+
+/// What was recorded before a request that is stamped with `number`, stamped as much earlier: what belongs to a request is told by that.
+/// Messages without a header are as they were.
+pub fn stamped_before(message: &Recorded, request: &Recorded, number: u32) -> Bytes {
+    let begins = |line: &str| matches!(line.trim(), "Header header" | "std_msgs/Header header");
+    let fields = message.wire_type.definition.lines().map(str::trim);
+    let first = fields
+        .clone()
+        .find(|line| !line.is_empty() && !line.starts_with('#'));
+    if !first.is_some_and(begins) {
+        return message.bytes.clone();
+    }
+    let earlier = request.time.saturating_sub(message.time);
+    let stamp = (u64::from(number) * SECOND).saturating_sub(earlier);
+    let stamp = ((stamp / SECOND) as u32, (stamp % SECOND) as u32);
+    stamped_at(&message.bytes, stamp).unwrap_or_else(|| message.bytes.clone())
+}
+
+fn stamped_at(bytes: &Bytes, (seconds, nanoseconds): (u32, u32)) -> Option<Bytes> {
     header(bytes)?;
     let mut message = bytes.to_vec();
-    message[4..8].copy_from_slice(&number.to_le_bytes());
-    message[8..12].copy_from_slice(&[0; 4]);
+    message[4..8].copy_from_slice(&seconds.to_le_bytes());
+    message[8..12].copy_from_slice(&nanoseconds.to_le_bytes());
     Some(message.into())
 }
 
@@ -234,5 +256,21 @@ mod tests {
         let again = restamped(&bytes, 1001).expect("it has a header");
         assert_eq!(header(&again).map(|header| header.stamp), Some((1001, 0)));
         assert_eq!(restamped(&Bytes::from_static(b"short"), 1), None);
+    }
+
+    #[test]
+    fn what_comes_before_a_request_stays_as_much_before_it() {
+        let typed = |definition: &str, time: u64| Recorded {
+            wire_type: Arc::new(ros::bus::WireType::new("a/B", "0", definition)),
+            time,
+            ..recorded("/odom", 0, &stamped(42, &[]))
+        };
+        let request = recorded("/scan", 100, b"");
+        let before = typed("# where it is\n\nHeader header\nfloat64 x", 99_999_000_000);
+        let again = stamped_before(&before, &request, 7);
+        let stamp = header(&again).map(|header| header.stamp);
+        assert_eq!(stamp, Some((6, 999_000_000)));
+        let plain = typed("float64 x\nHeader header", 99_999_000_000);
+        assert_eq!(stamped_before(&plain, &request, 7), plain.bytes);
     }
 }

@@ -9,17 +9,19 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use nix::sys::signal::Signal;
-use ros::bus::{Bus, Message, Publisher, Qos, Subscription};
+use ros::bus::{Bus, Matched, Message, Publisher, Qos, Subscription};
 use ros::ros1::Ros1Bus;
 use serde::{Deserialize, Serialize};
 use servant::cgroup::Cgroup;
 use support::site::{Running, Site};
+use tokio::sync::watch::Receiver;
 use tokio::time::{Instant as At, sleep_until, timeout};
 
+use crate::application;
 use crate::place::Network;
-use crate::recording::{Recording, Step, header, numbers, pose, restamped};
+use crate::recording::{Recording, Step, header, numbers, pose, restamped, stamped_before};
 use crate::trace::{Grid, Phases, Request, Trace};
 
 /// Stamps of requests begin after this one.
@@ -28,6 +30,14 @@ pub const FIRST: u32 = 1000;
 pub const WARM_UP: usize = 3;
 /// An answer to a request of the warm-up; a node of several seconds' start is waited for.
 const BEGINNING: Duration = Duration::from_secs(40);
+/// For the node to connect to what it is asked by, and the robot to its answers.
+const CONNECTION: Duration = Duration::from_secs(120);
+/// For the node to connect to what comes with requests.
+const OTHERS: Duration = Duration::from_secs(5);
+/// Between two looks at whether the node is still there.
+const LOOK: Duration = Duration::from_millis(500);
+/// For what a node tells besides its last answer.
+const BESIDES: Duration = Duration::from_millis(300);
 /// For answers that are under way after the last request that is played at a rate.
 const STRAGGLERS: Duration = Duration::from_secs(10);
 
@@ -44,6 +54,9 @@ pub struct Plan {
     pub request: String,
     /// Recorded topics that are no inputs.
     pub left_out: Vec<String>,
+    /// Recorded topics that `rosbag play` plays beside the requests.
+    #[serde(default)]
+    pub besides: Vec<String>,
     /// The topic of answers, with the header of what they answer.
     pub answer: String,
     /// Answers begin like a `geometry_msgs/PoseStamped`.
@@ -82,6 +95,8 @@ pub enum Pace {
         /// Seconds within which an answer is in time.
         in_time: f64,
     },
+    /// By `rosbag play`, at its own rate and with its own stamps, so many seconds of the recording.
+    Played(f64),
 }
 
 /// Who answers on the robot.
@@ -131,6 +146,12 @@ struct Ends {
 }
 
 fn run(plan: &Plan) -> Result<Trace> {
+    if let Pace::Played(seconds) = plan.pace {
+        let site = Site::new()?;
+        let node = start(&site, plan)?;
+        let heard = application::run(&site, plan, seconds, &node);
+        return heard.with_context(|| format!("the node said: {}", node.said()));
+    }
     let recording = Recording::read(&plan.recording)?;
     let steps: Vec<Step> = recording.steps(&plan.request);
     ensure!(
@@ -149,7 +170,12 @@ fn run(plan: &Plan) -> Result<Trace> {
         trace.answered_locally = node.said().matches("answer=Some((Local").count();
         rate::told(&node.said(), &mut trace.requests);
         let warns = |line: &&str| line.contains(" WARN ");
-        trace.warnings = node.said().lines().filter(warns).map(str::to_owned).collect();
+        trace.warnings = node
+            .said()
+            .lines()
+            .filter(warns)
+            .map(str::to_owned)
+            .collect();
     }
     if trace.node_ended.is_none() {
         // As roslaunch would.
@@ -216,8 +242,20 @@ fn ask(
 ) -> Result<Trace> {
     let request = ends.inputs.iter().find(|(name, _)| **name == *plan.request);
     let (_, publisher) = request.context("the topic of requests is recorded")?;
-    site.connected(&**publisher, 1)?;
-    site.fed(&ends.answers, 1)?;
+    // What is published before the other end is there is lost, and answers would differ from run to run.
+    let connects = (publisher.matched(), ends.answers.matched.clone());
+    let mut ended = Trace::default();
+    if !connected(site, connects, node, &mut ended)? {
+        return Ok(ended);
+    }
+    for (_, publisher) in &ends.inputs {
+        let mut now = publisher.matched();
+        let others = now.wait_for(|now| now.connected() > 0);
+        // A package need not listen to all that was recorded.
+        let _ = site
+            .runtime
+            .block_on(async { timeout(OTHERS, others).await.is_ok() });
+    }
     site.runtime.block_on(async {
         let (warm_up, measured) = steps.split_at(WARM_UP);
         for (index, step) in warm_up.iter().enumerate() {
@@ -234,11 +272,22 @@ fn ask(
         let mut trace = match plan.pace {
             Pace::OneByOne => ends.one_by_one(plan, &chosen, node).await?,
             Pace::Recorded(speed) => ends.as_recorded(speed, &chosen, node).await?,
+            Pace::Played(_) => bail!("rosbag plays by itself"),
             Pace::Rate { hertz, in_time } => {
                 let cycle: Vec<&Step> = measured.iter().cycle().take(plan.most).collect();
                 ends.at_a_rate(plan, (hertz, in_time), &cycle, node).await?
             }
         };
+        // What the node tells on other topics comes on other connections, and may be a little later than its last answer.
+        let until = At::now() + BESIDES;
+        let unheard = |trace: &Trace| {
+            let last = trace.requests.last();
+            last.is_some_and(|last| last.response.is_some() && last.phases.is_none())
+        };
+        while ends.timing.is_some() && unheard(&trace) && At::now() < until {
+            ends.besides(&mut trace);
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
         ends.besides(&mut trace);
         Ok(trace)
     })
@@ -253,7 +302,10 @@ impl Ends {
             }
         };
         for message in &step.before {
-            send(&message.topic, message.bytes.clone());
+            send(
+                &message.topic,
+                stamped_before(message, step.request, number),
+            );
         }
         let request = restamped(&step.request.bytes, number);
         let request = request
@@ -275,6 +327,17 @@ impl Ends {
         waited.await.ok().flatten()
     }
 
+    /// The same, but no longer than the node is there.
+    async fn answer_while(&mut self, number: u32, until: At, node: &Running) -> Option<Message> {
+        loop {
+            let left = until.saturating_duration_since(At::now());
+            let message = self.answer(number, left.min(LOOK)).await;
+            if message.is_some() || left <= LOOK || has_ended(node) {
+                return message;
+            }
+        }
+    }
+
     async fn one_by_one(
         &mut self,
         plan: &Plan,
@@ -287,13 +350,13 @@ impl Ends {
             let number = FIRST + index as u32;
             let sent = Instant::now();
             self.publish(step, number)?;
-            let give_up = Duration::from_secs_f64(plan.give_up);
+            let until = At::now() + Duration::from_secs_f64(plan.give_up);
             let mut request = Request {
                 at: (sent - begun).as_secs_f64(),
                 stamp: step.at,
                 ..Request::default()
             };
-            if let Some(message) = self.answer(number, give_up).await {
+            if let Some(message) = self.answer_while(number, until, node).await {
                 answered(&mut request, &message, sent.elapsed());
                 request.pose = request.pose.filter(|_| plan.tells_pose);
                 request.carried = carried::so_far()?;
@@ -331,8 +394,19 @@ impl Ends {
             self.publish(step, FIRST + index as u32)?;
             self.besides(&mut trace);
         }
-        self.collect(&mut trace.requests, &sent, At::now() + STRAGGLERS)
-            .await;
+        let until = At::now() + STRAGGLERS;
+        loop {
+            // The last answer ends it: those before it come no more, and its map is on its way.
+            let all = trace
+                .requests
+                .last()
+                .is_none_or(|last| last.response.is_some());
+            self.collect(&mut trace.requests, &sent, At::now() + LOOK)
+                .await;
+            if all || At::now() > until {
+                break;
+            }
+        }
         let_go(node, &mut trace)?;
         trace.lasted = begun.elapsed().as_secs_f64();
         Ok(trace)
@@ -394,12 +468,37 @@ impl Ends {
     }
 }
 
+/// Whether the node is connected to requests and the robot to answers; not where the node has ended, which is noted.
+fn connected(
+    site: &Site,
+    (mut requests, mut answers): (Receiver<Matched>, Receiver<Matched>),
+    node: &Running,
+    trace: &mut Trace,
+) -> Result<bool> {
+    let begun = Instant::now();
+    loop {
+        let both = async {
+            let there = |now: &Matched| now.connected() > 0;
+            requests.wait_for(there).await.is_ok() && answers.wait_for(there).await.is_ok()
+        };
+        let reached = site.runtime.block_on(async { timeout(LOOK, both).await });
+        if matches!(reached, Ok(true)) {
+            return Ok(true);
+        }
+        if let_go(node, trace)? {
+            return Ok(false);
+        }
+        ensure!(
+            begun.elapsed() < CONNECTION,
+            "{} s after its start the node is not connected to the robot's topics",
+            CONNECTION.as_secs()
+        );
+    }
+}
+
 /// Whether the node has ended, which is noted.
 fn let_go(node: &Running, trace: &mut Trace) -> Result<bool> {
-    let stat = std::fs::read_to_string(format!("/proc/{}/stat", node.pid()));
-    // The state stands behind the name, which is in parentheses (proc(5)).
-    let state = stat.as_deref().unwrap_or(") X").rsplit(") ").next();
-    let ended = state.is_some_and(|state| state.starts_with(['Z', 'X']));
+    let ended = has_ended(node);
     if ended {
         let said = node.said();
         let last = said.lines().last().unwrap_or("nothing");
@@ -408,16 +507,29 @@ fn let_go(node: &Running, trace: &mut Trace) -> Result<bool> {
     Ok(ended)
 }
 
+/// Whether its process is there no more.
+pub fn has_ended(node: &Running) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{}/stat", node.pid()));
+    // The state stands behind the name, which is in parentheses (proc(5)).
+    let state = stat.as_deref().unwrap_or(") X").rsplit(") ").next();
+    state.is_some_and(|state| state.starts_with(['Z', 'X']))
+}
+
 fn number_of(message: &Message) -> Option<u32> {
     header(&message.bytes).map(|header| header.stamp.0)
 }
 
 fn answered(request: &mut Request, message: &Message, after: Duration) {
-    let mut hasher = DefaultHasher::new();
-    message.bytes.get(4..).hash(&mut hasher);
     request.response = Some(after.as_secs_f64());
-    request.digest = Some(hasher.finish());
+    request.digest = Some(digest(&message.bytes));
     request.pose = pose(&message.bytes);
+}
+
+/// Of a message without its header's sequence number.
+pub fn digest(bytes: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    bytes.get(4..).hash(&mut hasher);
+    hasher.finish()
 }
 
 /// A serialized `nav_msgs/OccupancyGrid`.

@@ -145,7 +145,7 @@ exec unshare --pid --fork --kill-child sh -euc '
 "#;
 
 /// The file system that all share, named by what it is made of.
-fn base() -> anyhow::Result<PathBuf> {
+pub fn base() -> anyhow::Result<PathBuf> {
     let cache = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)
         .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))

@@ -77,18 +77,20 @@ pub fn section(runs: &Runs) -> Section {
         [
             "where",
             "requests answered",
+            "published",
             "processes ended for want of memory",
             "median, ms",
         ],
     );
-    for (name, run) in [
-        ("native", &runs.native),
-        ("outsourced, LAN", &runs.outsourced),
+    for (name, published, run) in [
+        ("native", "SSD could not be run", &runs.native),
+        ("outsourced, LAN", "SSD answered", &runs.outsourced),
     ] {
         match run {
             Measured::Done((trace, cost)) => table.push([
                 name.to_owned(),
                 format!("{} of {REQUESTS}", trace.answered()),
+                published.to_owned(),
                 cost.killed_for_memory.to_string(),
                 milliseconds(quantile(&trace.responses(), 0.5)),
             ]),
@@ -142,8 +144,8 @@ mod tests {
             outsourced: Measured::Done((outsourced, Cost::default())),
         });
         assert_eq!(
-            section.tables[0].rows[0][1..3],
-            ["0 of 5", "1"].map(str::to_owned)
+            section.tables[0].rows[0][1..4],
+            ["0 of 5", "SSD could not be run", "1"].map(str::to_owned)
         );
         assert!(
             section.findings[0].contains("want of memory"),

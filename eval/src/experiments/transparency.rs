@@ -1,14 +1,18 @@
 //! Experiment 1: packages answer the same on the robot and through the stub, and nothing of the robot's application is changed for it.
 
+use std::collections::BTreeMap;
+
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::application;
 use crate::cells::{Cells, Measured};
-use crate::examples::{ALL, Example, Where, Workshop};
+use crate::examples::{ALL, Example, LASER_SLAM, Where, Workshop};
 use crate::place::{Class, Network, Place};
+use crate::robot::Pace;
 use crate::section::{Missing, Section, Table};
-use crate::trace::Trace;
+use crate::trace::{Grid, Trace};
 use crate::words::digits;
 
 /// A robot that is not slowed down: what is compared is what is answered, not when.
@@ -16,150 +20,311 @@ const FAST: Class = Class {
     cores: 1.0,
     memory: 4 << 30,
 };
+/// Runs on the robot, which tell how much a package differs from run to run by itself.
+const NATIVES: usize = 3;
+/// Seconds of the drive that `rosbag play` plays, and of a quick evaluation.
+const PLAYED: [f64; 2] = [20.0, 4.0];
 
-/// One package, twice on the robot and once through the stub.
+/// One package, some times on the robot and once through the stub.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Compared {
-    native: Trace,
-    again: Trace,
+    natives: Vec<Trace>,
     outsourced: Trace,
-    /// Of the robot's own program, before and after (SHA-256).
-    application: [String; 2],
+    /// Files of the robot's application, with their SHA-256 before and after.
+    application: Vec<(String, String, String)>,
 }
 
-/// By package.
+/// By package, and by application.
 pub struct Runs {
-    compared: Vec<(Example, Measured<Compared>)>,
+    compared: Vec<(Pair, Measured<Compared>)>,
+}
+
+/// What asks what.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Pair {
+    package: &'static str,
+    application: Application,
+}
+
+/// The robot's own program.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Application {
+    /// Of this evaluation.
+    Own,
+    /// `rosbag play` and `rosbag record`, as Debian packages them.
+    Rosbag,
+}
+
+impl Application {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Own => "the evaluation's node",
+            Self::Rosbag => "rosbag",
+        }
+    }
+
+    /// Files, and their SHA-256.
+    fn checksums(self) -> Result<Vec<(String, String)>> {
+        match self {
+            Self::Rosbag => application::checksums(),
+            Self::Own => {
+                let program = std::fs::read("/proc/self/exe")?;
+                let sum = format!("{:x}", Sha256::digest(program));
+                Ok(vec![("eval".to_owned(), sum)])
+            }
+        }
+    }
 }
 
 /// Measures them; so many requests each at the most.
 pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Result<Runs> {
     let mut compared = Vec::new();
-    for example in ALL {
-        let most = most.unwrap_or(example.requests).min(example.requests);
-        let measured = cells.measure(&format!("transparency {}", example.name), &most, || {
+    let own = ALL.map(|example| (example, Application::Own));
+    let all = own.into_iter().chain([(LASER_SLAM, Application::Rosbag)]);
+    for (example, application) in all {
+        let pair = Pair {
+            package: example.name,
+            application,
+        };
+        let name = format!("transparency {} {}", example.name, application.name());
+        let requests = most.unwrap_or(example.requests).min(example.requests);
+        let seconds = PLAYED[usize::from(most.is_some())];
+        let measured = cells.measure(&name, &(requests, seconds, NATIVES), || {
             workshop.publishes(&example)?;
-            let before = checksum()?;
-            let run = |at: Where| -> Result<Trace> {
-                let directory = workshop.directory()?;
-                let mut plan = workshop.plan(&example, at, directory.path())?;
-                plan.most = most;
-                let place = Place::new(&workshop.daemon.address, FAST, Network::Lan)?;
-                Ok(place.runs(&plan, directory.path())?.0)
-            };
+            let before = application.checksums()?;
+            let run = |at: Where| one(workshop, &example, at, application, (requests, seconds));
+            let natives = (0..NATIVES).map(|_| run(Where::Native));
+            let natives = natives.collect::<Result<_>>()?;
+            let outsourced = run(Where::Outsourced)?;
+            let after = application.checksums()?.into_iter();
+            let application = before.into_iter().zip(after);
             Ok(Compared {
-                native: run(Where::Native)?,
-                again: run(Where::Native)?,
-                outsourced: run(Where::Outsourced)?,
-                application: [before, checksum()?],
+                natives,
+                outsourced,
+                application: application
+                    .map(|((file, before), (_, after))| (file, before, after))
+                    .collect(),
             })
         })?;
-        compared.push((example, measured));
+        compared.push((pair, measured));
     }
     Ok(Runs { compared })
 }
 
-/// Of this program, which is the robot's application.
-fn checksum() -> Result<String> {
-    let program = std::fs::read(std::env::current_exe()?)?;
-    Ok(format!("{:x}", Sha256::digest(program)))
+fn one(
+    workshop: &Workshop,
+    example: &Example,
+    at: Where,
+    application: Application,
+    (requests, seconds): (usize, f64),
+) -> Result<Trace> {
+    let directory = workshop.directory()?;
+    let mut plan = workshop.plan(example, at, directory.path())?;
+    plan.most = requests;
+    if application == Application::Rosbag {
+        plan.pace = Pace::Played(seconds);
+    }
+    let place = Place::new(&workshop.daemon.address, FAST, Network::Lan)?;
+    Ok(place.runs(&plan, directory.path())?.0)
 }
 
-/// How much two runs differ: requests that both answered, those whose answers were equal to the byte, and the largest distance of
-/// positions, metres.
-fn difference(one: &Trace, other: &Trace) -> (usize, usize, Option<f64>) {
-    let pairs = one.requests.iter().zip(&other.requests);
-    let both: Vec<_> = pairs
-        .filter(|(one, other)| one.digest.is_some() && other.digest.is_some())
-        .collect();
-    let equal = both
-        .iter()
-        .filter(|(one, other)| one.digest == other.digest)
-        .count();
-    let distances = both.iter().filter_map(|(one, other)| {
-        let (one, other) = (one.pose?, other.pose?);
-        Some(f64::hypot(one[0] - other[0], one[1] - other[1]))
-    });
-    (both.len(), equal, distances.reduce(f64::max))
+/// How much runs differ.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Difference {
+    /// Requests that both of two runs answered.
+    both: usize,
+    /// Those of them whose answers were equal to the byte.
+    equal: usize,
+    /// The largest distance of positions, metres.
+    distance: Option<f64>,
+    /// The largest share of a map's cells that differ.
+    map: Option<f64>,
+}
+
+impl Difference {
+    fn of(one: &Trace, other: &Trace) -> Self {
+        // By the stamps: a robot that plays by itself need not hear every answer.
+        let key = |stamp: f64| (stamp * 1e6).round() as i64;
+        let others: BTreeMap<i64, _> = other
+            .requests
+            .iter()
+            .map(|one| (key(one.stamp), one))
+            .collect();
+        let mut found = Self {
+            map: one.map.as_ref().zip(other.map.as_ref()).map(cells_differ),
+            ..Self::default()
+        };
+        for one in &one.requests {
+            let Some(other) = others.get(&key(one.stamp)) else {
+                continue;
+            };
+            let (Some(digest), Some(another)) = (one.digest, other.digest) else {
+                continue;
+            };
+            found.both += 1;
+            found.equal += usize::from(digest == another);
+            if let (Some(one), Some(other)) = (one.pose, other.pose) {
+                let distance = f64::hypot(one[0] - other[0], one[1] - other[1]);
+                found.distance = largest(found.distance, Some(distance));
+            }
+        }
+        found
+    }
+
+    /// Of all these together.
+    fn sum(all: impl Iterator<Item = Self>) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            both: sum.both + one.both,
+            equal: sum.equal + one.equal,
+            distance: largest(sum.distance, one.distance),
+            map: largest(sum.map, one.map),
+        })
+    }
+
+    /// Of pairs of these runs.
+    fn among(runs: &[Trace]) -> Self {
+        let pairs = runs.iter().enumerate();
+        Self::sum(
+            pairs
+                .flat_map(|(at, one)| runs[at + 1..].iter().map(move |other| Self::of(one, other))),
+        )
+    }
+
+    /// No more than that.
+    fn within(self, own: Self) -> bool {
+        let share = |of: Self| of.equal as f64 / of.both.max(1) as f64;
+        share(self) >= share(own)
+            && self.distance.unwrap_or(0.0) <= own.distance.unwrap_or(0.0)
+            && self.map.unwrap_or(0.0) <= own.map.unwrap_or(0.0)
+    }
+}
+
+fn largest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.max(other)),
+        (one, other) => one.or(other),
+    }
+}
+
+/// The share of cells that differ; all of them where the maps are of different places or sizes.
+fn cells_differ((one, other): (&Grid, &Grid)) -> f64 {
+    let same = (one.width, one.height, one.origin) == (other.width, other.height, other.origin);
+    if !same || one.cells.is_empty() {
+        return 1.0;
+    }
+    let pairs = one.cells.iter().zip(&other.cells);
+    let differ = pairs.filter(|(one, other)| one != other).count();
+    differ as f64 / one.cells.len() as f64
 }
 
 /// What the report says.
 pub fn section(runs: &Runs) -> Section {
     let mut section = Section::new(1, "transparency", "Unmodified packages answer the same");
     section.published = "The publication's packages and robot applications were not modified; their results are said to be the same.".to_owned();
-    section.differs = vec!["Each package is asked the same requests twice on the robot, and through the stub: what the two runs on the robot differ by is its own difference from run to run.".to_owned(), "The robot's application is the evaluation's own node: one program, which knows neither where the package runs nor that there are stubs. Its checksum shows that nothing was written into it meanwhile, and no more.".to_owned()];
-    let mut table = Table::new(
+    section.differs = vec![
+        format!("Each package is asked the same requests {NATIVES} times on the robot, and through the stub: what the runs on the robot differ by is the package's own difference from run to run."),
+        "The robot's application is once the evaluation's own node, and once rosbag play and rosbag record as Debian packages them, which play the drive at its own rate and write the answers down; the same files run in both set-ups.".to_owned(),
+        "The order of messages of different topics is not kept by the stub's link (small ones go in turns), as ROS does not keep it: each topic has a connection of its own. A node that takes whatever odometry came last answers differently from run to run; these take that which was stamped with the scan's time.".to_owned(),
+    ];
+    let mut answers = Table::new(
         "Answers to the same requests",
         [
             "package",
+            "the robot's application",
             "compared",
             "answered by both",
             "equal to the byte",
             "largest distance of positions, m",
+            "cells of the map that differ, %",
         ],
     );
-    for (example, measured) in &runs.compared {
+    let mut files = Table::new(
+        "The robot's application, before and after its run",
+        ["asked", "file", "SHA-256 before", "SHA-256 after"],
+    );
+    for (pair, measured) in &runs.compared {
         let compared = match measured {
             Measured::Done(compared) => compared,
             Measured::Missing(why) => {
                 section.missing.push(Missing {
-                    what: example.name.to_owned(),
+                    what: format!("{}, asked by {}", pair.package, pair.application.name()),
                     why: why.clone(),
                     next: "run make eval again: what was measured stays".to_owned(),
                 });
                 continue;
             }
         };
-        let own = difference(&compared.native, &compared.again);
-        let through = difference(&compared.native, &compared.outsourced);
-        for (name, (both, equal, distance)) in [("native twice", own), ("native and stub", through)]
-        {
-            table.push([
-                example.name.to_owned(),
+        let own = Difference::among(&compared.natives);
+        let natives = compared.natives.iter();
+        let through =
+            Difference::sum(natives.map(|native| Difference::of(native, &compared.outsourced)));
+        let published = "published: the same, without figures".to_owned();
+        for (name, difference) in [("native runs", own), ("native and stub", through)] {
+            let said = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), digits);
+            answers.push([
+                pair.package.to_owned(),
+                pair.application.name().to_owned(),
                 name.to_owned(),
-                both.to_string(),
-                equal.to_string(),
-                distance.map_or_else(|| "–".to_owned(), digits),
+                difference.both.to_string(),
+                difference.equal.to_string(),
+                said(difference.distance),
+                said(difference.map.map(|share| 100.0 * share)),
             ]);
         }
-        section.findings.push(finding(example.name, own, through));
-        let [before, after] = &compared.application;
-        section.findings.push(if before == after {
+        answers.rows.last_mut().into_iter().for_each(|row| {
+            row[2] = format!("{} ({published})", row[2]);
+        });
+        section.findings.push(finding(*pair, own, through));
+        for (file, before, after) in &compared.application {
+            files.push([
+                pair.package.to_owned(),
+                file.clone(),
+                before.clone(),
+                after.clone(),
+            ]);
+        }
+        let changed = compared.application.iter();
+        let changed: Vec<&str> = changed
+            .filter(|(_, before, after)| before != after)
+            .map(|(file, _, _)| file.as_str())
+            .collect();
+        section.findings.push(if changed.is_empty() {
             format!(
-                "The robot's application was the same program for {}: SHA-256 {before}.",
-                example.name
+                "Not one byte of the robot's application ({}) differs between the set-ups of {}.",
+                pair.application.name(),
+                pair.package
             )
         } else {
             format!(
-                "The robot's application CHANGED while {} was compared.",
-                example.name
+                "The robot's application CHANGED while {} was compared: {}.",
+                pair.package,
+                changed.join(", ")
             )
         });
     }
-    section.tables.push(table);
+    section.tables.extend([answers, files]);
     section
 }
 
-fn finding(
-    name: &str,
-    own: (usize, usize, Option<f64>),
-    through: (usize, usize, Option<f64>),
-) -> String {
-    let (both, equal, distance) = through;
-    if both > 0 && both == equal {
+fn finding(pair: Pair, own: Difference, through: Difference) -> String {
+    let name = format!("{}, asked by {}", pair.package, pair.application.name());
+    if through.both == 0 {
+        return format!("{name}: nothing was answered both on the robot and through the stub.");
+    }
+    if through.both == through.equal {
         return format!(
-            "{name}: all {both} answers through the stub are those of the robot, to the byte."
+            "{name}: all {} answers through the stub that were compared are those of the robot, to the byte.",
+            through.both
         );
     }
-    let within = distance.unwrap_or(0.0) <= own.2.unwrap_or(0.0);
-    let words = if within && equal >= own.1 {
+    let words = if through.within(own) {
         "within"
     } else {
         "NOT within"
     };
     format!(
-        "{name}: {equal} of {both} answers through the stub are equal to the byte, which is {words} what two runs on the robot differ by ({} of {}).",
-        own.1, own.0
+        "{name}: {} of {} answers through the stub are equal to the byte, which is {words} what runs on the robot differ by ({} of {}).",
+        through.equal, through.both, own.equal, own.both
     )
 }
 
@@ -169,29 +334,90 @@ mod tests {
     use crate::trace::Request;
 
     fn trace(answers: &[(u64, f64)]) -> Trace {
-        let request = |(digest, x): &(u64, f64)| Request {
+        let request = |(number, (digest, x)): (u32, &(u64, f64))| Request {
+            stamp: number.into(),
             digest: Some(*digest),
             pose: Some([*x, 0.0, 0.0]),
             ..Request::default()
         };
         Trace {
-            requests: answers.iter().map(request).collect(),
+            requests: (0..).zip(answers).map(request).collect(),
             ..Trace::default()
         }
     }
+
+    fn difference(both: usize, equal: usize, distance: f64) -> Difference {
+        Difference {
+            both,
+            equal,
+            distance: Some(distance),
+            map: None,
+        }
+    }
+
+    const PAIR: Pair = Pair {
+        package: "a",
+        application: Application::Rosbag,
+    };
 
     #[test]
     fn differences_are_counted_and_measured() {
         let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
         let other = trace(&[(1, 0.0), (5, 1.5), (3, 2.0)]);
-        assert_eq!(difference(&one, &other), (3, 2, Some(0.5)));
+        assert_eq!(Difference::of(&one, &other), difference(3, 2, 0.5));
+        let all = Difference::among(&[one.clone(), other, one]);
+        assert_eq!(all, difference(9, 7, 0.5));
+    }
+
+    #[test]
+    fn answers_are_compared_by_their_stamps() {
+        let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
+        let mut other = one.clone();
+        other.requests.remove(1);
+        assert_eq!(Difference::of(&one, &other), difference(2, 2, 0.0));
+    }
+
+    #[test]
+    fn cells_that_differ_are_a_share_of_all() {
+        let map = |cells: &[i8]| Grid {
+            width: 2,
+            height: 2,
+            resolution: 0.1,
+            origin: [0.0, 0.0],
+            cells: cells.to_vec(),
+        };
+        let (one, other) = (map(&[0, 100, -1, 0]), map(&[0, 100, 0, 0]));
+        assert_eq!(cells_differ((&one, &other)), 0.25);
+        let elsewhere = Grid {
+            origin: [1.0, 0.0],
+            ..one.clone()
+        };
+        assert_eq!(cells_differ((&one, &elsewhere)), 1.0);
     }
 
     #[test]
     fn a_stub_that_answers_otherwise_is_told() {
-        let alike = (3, 3, Some(0.0));
-        assert!(finding("a", alike, alike).contains("all 3"));
-        assert!(finding("a", alike, (3, 1, Some(1.0))).contains("NOT within"));
-        assert!(finding("a", (3, 1, Some(1.0)), (3, 1, Some(0.9))).contains("is within"));
+        let alike = difference(3, 3, 0.0);
+        assert!(finding(PAIR, alike, alike).contains("all 3"));
+        assert!(finding(PAIR, alike, difference(3, 1, 1.0)).contains("NOT within"));
+        let own = difference(3, 1, 1.0);
+        assert!(finding(PAIR, own, difference(9, 3, 0.9)).contains("is within"));
+        assert!(finding(PAIR, own, difference(3, 1, 1.1)).contains("NOT within"));
+        assert!(finding(PAIR, own, Difference::default()).contains("nothing"));
+    }
+
+    #[test]
+    fn a_changed_application_is_told() {
+        let compared = |after: &str| Compared {
+            natives: vec![trace(&[(1, 0.0)]); 2],
+            outsourced: trace(&[(1, 0.0)]),
+            application: vec![("/play".to_owned(), "12".to_owned(), after.to_owned())],
+        };
+        let told = |after: &str| {
+            let compared = vec![(PAIR, Measured::Done(compared(after)))];
+            section(&Runs { compared }).findings[1].clone()
+        };
+        assert!(told("12").contains("Not one byte"));
+        assert!(told("13").contains("CHANGED"), "{}", told("13"));
     }
 }
