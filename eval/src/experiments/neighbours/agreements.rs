@@ -63,8 +63,8 @@ pub(super) struct Runs(Vec<(Plan, Measured<Vec<Had>>)>);
 
 pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
     let robots: &[usize] = if quick { &[4] } else { &[2, 4, 8] };
-    // The controller looks once a second and moves cores in steps.
-    let (settles, lasts) = if quick { (1.0, 1.5) } else { (8.0, 9.0) };
+    // The controller looks once a second, at what requests took in the last ten.
+    let (settles, lasts) = if quick { (1.0, 1.5) } else { (12.0, 9.0) };
     let mut runs = Vec::new();
     for controller in BOTH {
         for robots in robots.iter().copied() {

@@ -70,7 +70,7 @@ pub(super) struct Runs(Vec<(Plan, Measured<Beside>)>);
 
 pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
     let neighbours: &[usize] = if quick { &[0, 2] } else { &[0, 1, 2, 4, 8] };
-    let (settles, lasts) = if quick { (0.3, 1.2) } else { (1.5, 5.0) };
+    let (settles, lasts) = if quick { (0.3, 1.2) } else { (1.5, 7.0) };
     let mut points = Vec::new();
     for policy in Policy::ALL {
         for neighbours in neighbours.iter().copied() {
