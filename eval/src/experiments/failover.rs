@@ -131,7 +131,7 @@ fn one(workshop: &Workshop, set_up: SetUp, course: &Course) -> Result<(Trace, Co
     };
     plan.pace = Pace::Rate {
         hertz: HERTZ,
-        in_time: TIMES.1,
+        in_time: 2.0 * TIMES.1,
     };
     plan.most = course.requests;
     plan.give_up = course.stragglers;

@@ -116,7 +116,12 @@ pub(super) fn base<'a>(runs: &'a Runs, what: &What) -> Option<(&'a What, &'a Sen
 }
 
 fn percent(value: Option<f64>) -> String {
-    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.1} %"))
+    // Adding nothing makes zero of what is rounded to minus zero.
+    let rounded = |value: f64| (value * 10.0).round() / 10.0 + 0.0;
+    value.map_or_else(
+        || "–".to_owned(),
+        |value| format!("{:.1} %", rounded(value)),
+    )
 }
 
 fn bytes(value: Option<f64>) -> String {

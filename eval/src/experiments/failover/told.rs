@@ -11,10 +11,11 @@ use crate::trace::Request;
 use crate::words::{digits, milliseconds};
 
 /// Of points.
-const CLASSES: [&str; 3] = [
+const CLASSES: [&str; 4] = [
     "answered by the cloud",
     "answered by the local original",
     "later than T_max",
+    "never answered (at the top)",
 ];
 
 /// What the report says.
@@ -190,14 +191,16 @@ fn numbered(values: impl IntoIterator<Item = f64>) -> Vec<(f64, f64)> {
 
 fn drawn(runs: &Runs, run: &Run) -> Banded {
     let requests = run.measured.done().map_or(&[][..], |done| &done.0.requests);
+    let answered = requests.iter().filter_map(|request| request.response);
+    // As long as answers were waited for after the last request.
+    let top = answered.fold(runs.course.stragglers, f64::max);
     let point = |(number, request): (u32, &Request)| {
-        let class = match (is_late(request), is_local(run.set_up, request)) {
-            (true, _) => 2,
-            (false, local) => usize::from(local),
+        let class = match (request.response, is_late(request)) {
+            (None, _) => 3,
+            (Some(_), true) => 2,
+            (Some(_), false) => usize::from(is_local(run.set_up, request)),
         };
-        // What was never answered has no time to be drawn at: the plot says how many are left out.
-        let response = request.response.unwrap_or(f64::INFINITY);
-        (f64::from(number), response, class)
+        (f64::from(number), request.response.unwrap_or(top), class)
     };
     let own = |(number, request): (u32, &Request)| Some((f64::from(number), request.satisfaction?));
     Banded {
