@@ -40,6 +40,8 @@ mod crossing;
 mod cuts;
 #[path = "stories/described.rs"]
 mod described;
+#[path = "stories/eval.rs"]
+mod eval;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/fallback.rs"]
@@ -196,6 +198,10 @@ fn main() -> ExitCode {
             who_guesses_passwords_is_slowed,
             other_sites_pages_do_nothing_in_a_persons_browser,
             through_tls_the_cookie_is_shown_through_tls_alone,
+        ],
+        stories![eval:
+            a_package_is_evaluated_native_against_outsourced,
+            what_cannot_be_evaluated_is_said,
         ],
         stories![failover:
             a_slow_network_costs_few_requests,

@@ -13,7 +13,7 @@ use support::robot::Robot;
 use support::world::{PEOPLE, TELLER, world};
 
 /// Of Debian's opencv-doc.
-const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
+pub const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
 /// people_detect under a name of its own.
 const SERVICE: &str = "calibrated";
@@ -29,7 +29,7 @@ fn frames(directory: &Path) -> Verdict {
 }
 
 /// Servants that are measured, of a service.
-fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
+pub fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
     let servants = daemon.servants_of(service)?.into_iter();
     let measured = servants.filter(|servant| {
         let robot = servant["robot"].as_str().unwrap_or_default();
@@ -39,7 +39,7 @@ fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
 }
 
 /// None is left, once those that end have ended.
-fn none_is_left(daemon: &Daemon, service: &str) -> Verdict {
+pub fn none_is_left(daemon: &Daemon, service: &str) -> Verdict {
     support::until("the measured servant's end", || {
         let left = measured(daemon, service)?;
         Ok(if left.is_empty() {

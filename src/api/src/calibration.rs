@@ -48,7 +48,23 @@ pub struct CalibrationOptions {
     /// Auxiliary parameters of the rows, such as `image=640x480`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub aux: BTreeMap<String, String>,
+    /// Memory that the servant may use from its start on, as another machine would have it; without, the service's own limit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory: Option<Size>,
+    /// It is measured once, at the limits that servants of robots which state nothing have.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub own: bool,
+    /// The time of each request is told as well.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub times: bool,
+    /// Seconds for which the servant stays behind the last limit, at most: then whoever asked can use it over their own network,
+    /// and ends it by not reading on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keep: Option<f64>,
 }
+
+/// Kind of the [`Problem`] of a servant that needed more memory than it may use, before anything was measured.
+pub const OUT_OF_MEMORY: &str = "urn:cloudroid:out-of-memory";
 
 /// What the requests of a calibration are taken from.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,6 +94,16 @@ pub enum CalibrationEvent {
     Measured {
         /// What was measured.
         point: Point,
+        /// Time of each answered request, in their order, where that was asked for.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        times: Vec<f64>,
+    },
+    /// All limits have been measured, and the servant stays at the last of them for as long as was asked for.
+    Kept {
+        /// Its id.
+        servant: String,
+        /// What was found.
+        calibration: Box<Calibration>,
     },
     /// All limits have been measured; nothing has been written.
     Done {
@@ -169,6 +195,16 @@ impl TimeSpread {
             max: rank(100)?,
         })
     }
+}
+
+/// A time in milliseconds with two digits, never less than it was.
+pub fn rounded_up(milliseconds: f64) -> f64 {
+    // A time of nothing is none that anybody could ask for.
+    let milliseconds = milliseconds.max(1e-3);
+    let digit = 10f64.powf(milliseconds.log10().floor() - 1.0);
+    let up = (milliseconds / digit).ceil() * digit;
+    // What powers of ten left behind the digits.
+    (up * 1e6).round() / 1e6
 }
 
 #[cfg(test)]

@@ -21,6 +21,9 @@ pub struct Fit {
     /// Why nobody is admitted now, if so.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stalled: Option<String>,
+    /// Why it would never be admitted, if so: it is more than all that this machine has for servants.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub never: Option<String>,
     /// As many wait as may: one more that would have to wait is refused.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = false))]

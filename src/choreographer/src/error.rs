@@ -110,6 +110,19 @@ pub enum Error {
     /// A service cannot be calibrated so.
     #[error("{0}")]
     Calibration(String),
+    /// A servant that is measured needed more memory than it was to be measured with.
+    #[error(
+        "{service} needs more than {memory} of memory: the kernel has ended it{}",
+        if *ready { " at its requests" } else { " while it started" }
+    )]
+    OutOfMemory {
+        /// The service.
+        service: String,
+        /// What it may use.
+        memory: api::Size,
+        /// It had started.
+        ready: bool,
+    },
     /// A revision cannot be compared so with what a robot uses.
     #[error("{0}")]
     Shadow(String),

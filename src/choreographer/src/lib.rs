@@ -163,7 +163,9 @@ impl Choreographer {
                 inner.check_back_off(&revision, &request.robot, request.anonymous)?;
             }
             // Nobody who waits for capacity is overtaken by one that takes what was promised ahead.
-            let default_names = request.stub.is_none() && inner.admission.is_calm();
+            // Nor do nodes run already that may use less memory than they perhaps do.
+            let bounded = request.anonymous && request.stated.memory.is_some();
+            let default_names = request.stub.is_none() && !bounded && inner.admission.is_calm();
             let (placement, warm) = if is_place(&revision, &request.robot) {
                 // It needs no container.
                 let placement = place(has.as_ref(), None, revision.number, &revision.image);
@@ -406,7 +408,7 @@ impl Choreographer {
         service: &str,
         material: Material,
     ) -> Result<api::trial::Trial, Error> {
-        let measured = self.measured(service, "try")?;
+        let measured = self.measured(service, "try", api::Stated::default())?;
         measured.lease.admitted().await?;
         let reach = measured.lease.ready().await?;
         let interface = &measured.lease.handle().revision.interface;
@@ -421,9 +423,10 @@ impl Choreographer {
 
     /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name. Of a service that robots share
     /// it is one of its own, beside the group.
-    fn measured(&self, service: &str, why: &str) -> Result<Measured, Error> {
+    fn measured(&self, service: &str, why: &str, stated: api::Stated) -> Result<Measured, Error> {
         let robot = format!("~{why}-{}", names::random(6));
-        let lease = self.ensure(ServantRequest::new(service, &robot).anonymous())?;
+        let request = ServantRequest::new(service, &robot).stating(stated);
+        let lease = self.ensure(request.anonymous())?;
         Ok(Measured { lease })
     }
 

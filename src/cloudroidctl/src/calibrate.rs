@@ -1,6 +1,6 @@
 //! `calibrate`: what response times cost, measured, as rows of the dictionary.
 
-mod curve;
+pub(crate) mod curve;
 
 use std::fs;
 use std::io::{BufRead, IsTerminal, Write};
@@ -79,7 +79,7 @@ impl Calibrate {
             .curve
             .clone()
             .unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
-        check_place(&curve)?;
+        check_place(&curve, "curve")?;
         let calibration = tokio::select! {
             measured = self.measure(client, format, body) => measured?,
             _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
@@ -147,6 +147,7 @@ impl Calibrate {
             input: self.input.clone(),
             network: self.network,
             aux: self.aux.iter().cloned().collect(),
+            ..CalibrationOptions::default()
         }
     }
 
@@ -168,11 +169,12 @@ impl Calibrate {
         let mut events = client::lines(answer);
         while let Some(event) = events.next().await {
             match event? {
-                CalibrationEvent::Done { calibration } => return Ok(*calibration),
+                CalibrationEvent::Done { calibration }
+                | CalibrationEvent::Kept { calibration, .. } => return Ok(*calibration),
                 CalibrationEvent::Error { problem } => return Err(problem.into()),
                 event if format == Format::Json => output::json_line(&event)?,
                 CalibrationEvent::Step { title } => output::line(&format!("== {title}"))?,
-                CalibrationEvent::Measured { point } => {
+                CalibrationEvent::Measured { point, .. } => {
                     output::line(&format!("   {}", in_a_line(&point)))?;
                 }
             }
@@ -272,7 +274,7 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
 }
 
 /// Writes rows into the dictionary of a service.
-async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result<()> {
+pub(crate) async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result<()> {
     let new = NewRows {
         rows,
         replace: false,
@@ -282,8 +284,8 @@ async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result
     client.put::<Vec<Row>>(&path, &new).await.map(drop)
 }
 
-/// Refuses a place for the curve that cannot be written to, before minutes of measuring.
-fn check_place(curve: &Path) -> anyhow::Result<()> {
+/// Refuses a place for the picture of this option that cannot be written to, before minutes of measuring.
+pub(crate) fn check_place(curve: &Path, option: &str) -> anyhow::Result<()> {
     let new = !curve.exists();
     fs::OpenOptions::new()
         .append(true)
@@ -291,7 +293,7 @@ fn check_place(curve: &Path) -> anyhow::Result<()> {
         .open(curve)
         .with_context(|| {
             format!(
-                "the curve cannot be written to {}; name another place with --curve",
+                "the {option} cannot be written to {}; name another place with --{option}",
                 curve.display()
             )
         })?;
@@ -302,7 +304,7 @@ fn check_place(curve: &Path) -> anyhow::Result<()> {
 }
 
 /// Whether whoever sits at the terminal says yes; nobody does where there is none.
-fn agrees(service: &str) -> anyhow::Result<bool> {
+pub(crate) fn agrees(service: &str) -> anyhow::Result<bool> {
     if !std::io::stdin().is_terminal() {
         return Ok(false);
     }
@@ -322,7 +324,7 @@ fn is_yes(answer: &str) -> bool {
 }
 
 /// Proposed rows.
-fn rows(rows: &[Row]) -> anyhow::Result<()> {
+pub(crate) fn rows(rows: &[Row]) -> anyhow::Result<()> {
     let mut table = Table::new(&["ROW", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
     for row in rows {
         let shown = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
@@ -346,13 +348,14 @@ mod tests {
     #[test]
     fn a_curve_that_cannot_be_written_is_told_before_measuring() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = check_place(&place.path().join("gone/curve.svg")).expect_err("no directory");
+        let told =
+            check_place(&place.path().join("gone/curve.svg"), "curve").expect_err("no directory");
         assert!(format!("{told:#}").contains("--curve"), "{told:#}");
         let fine = place.path().join("curve.svg");
-        check_place(&fine).expect("it can be written");
+        check_place(&fine, "curve").expect("it can be written");
         assert!(!fine.exists(), "nothing is left");
         fs::write(&fine, "an earlier one").expect("written");
-        check_place(&fine).expect("it can be written");
+        check_place(&fine, "curve").expect("it can be written");
         assert_eq!(fs::read_to_string(&fine).expect("read"), "an earlier one");
     }
 

@@ -107,7 +107,7 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
         fit.cpus, fit.memory
     );
     let lacks = fit.lacking_cpus > 0.0 || fit.lacking_memory > Size(0);
-    let answer = match (&fit.stalled, fit.now) {
+    let now = match (&fit.stalled, fit.now) {
         (Some(why), _) => format!("it would wait: {why}"),
         (None, true) => "it would be started at once".to_owned(),
         (None, false) if fit.full => format!(
@@ -123,6 +123,10 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
             "it would be started when these have ended, which are idle: {}",
             fit.ends.join(", ")
         ),
+    };
+    let answer = match &fit.never {
+        Some(why) => format!("it would be refused, now and later: {why}"),
+        None => now,
     };
     let more = match fit.more {
         None => "as many as one likes would fit".to_owned(),
@@ -152,6 +156,7 @@ mod tests {
             waiting: 2,
             stalled: None,
             full: false,
+            never: None,
             now: false,
             ends: vec!["a-1".into()],
             lacking_cpus: 0.0,
@@ -171,6 +176,10 @@ mod tests {
             lacking_cpus: 0.5,
             more: Some(0),
             ..fit()
+        };
+        let never = api::Fit {
+            never: Some("64 cores are more than the 2 that servants may have".into()),
+            ..lacking.clone()
         };
         let full = api::Fit {
             full: true,
@@ -226,6 +235,7 @@ mod tests {
                 lacking,
                 "0.5 cores are lacking, and 2 wait already\nnone would fit",
             ),
+            (never, "it would be refused, now and later: 64 cores"),
             (full, "it would be refused: 2 wait already"),
             (now, "at once\nas many"),
             (stalled, "it would wait: this machine swaps"),

@@ -9,6 +9,7 @@ mod calibrate;
 mod client;
 mod diff;
 mod doctor;
+mod eval;
 mod events;
 mod exit;
 mod explain;
@@ -115,6 +116,7 @@ enum Verb {
     Stub(stub::Stub),
     Try(Box<trial::Try>),
     Calibrate(Box<calibrate::Calibrate>),
+    Eval(Box<eval::Eval>),
     Explain(explain::Explain),
     Fit(fit::Fit),
     Account(account::Accounts),
@@ -189,6 +191,7 @@ async fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Stub(verb) => verb.run(&client, format).await,
         Verb::Try(verb) => verb.run(&client, format).await,
         Verb::Calibrate(verb) => verb.run(&client, format).await,
+        Verb::Eval(verb) => verb.run(&client, format).await,
         Verb::Explain(verb) => verb.run(&client, format).await,
         Verb::Fit(verb) => verb.run(&client, format).await,
         Verb::Pair(verb) => verb.run(&client, format).await,

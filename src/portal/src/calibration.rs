@@ -30,6 +30,10 @@ const SECONDS: f64 = 20.0;
 const LONGEST: f64 = 600.0;
 /// Bytes of them, where nobody says it.
 const BYTES: Size = Size(256 << 20);
+/// The longest that a servant stays behind its last limit.
+const KEPT: f64 = 600.0;
+/// The least memory that anything can be measured with; nothing starts with less.
+const LEAST_MEMORY: f64 = (16 << 20) as f64;
 /// Limits that are measured in one calibration, and requests at each.
 const MOST_LIMITS: usize = 32;
 const MOST_REQUESTS: usize = 10_000;
@@ -173,9 +177,15 @@ fn check(options: &CalibrationOptions) -> Result<(), String> {
     }
     positive("rate", options.rate, 0.01, 10_000.0)?;
     positive("seconds", options.seconds, 0.1, LONGEST)?;
+    positive("keep", options.keep, 0.1, KEPT)?;
+    let memory = options.memory.map(|memory| memory.0 as f64);
+    positive("memory", memory, LEAST_MEMORY, f64::MAX)?;
     positive("network", options.network, 0.0, 3_600_000.0)?;
     let requests = options.requests.map(|requests| requests as f64);
     positive("requests", requests, 10.0, MOST_REQUESTS as f64)?;
+    if options.own && !options.cpus.is_empty() {
+        return Err("own and cpus exclude each other".to_owned());
+    }
     if options.rate.is_some() && options.fast {
         return Err("rate and fast exclude each other".to_owned());
     }
@@ -217,11 +227,14 @@ mod tests {
                 "seconds = 1000000000 is not between 0.1 and 600",
             ),
             (r#"{"network":-3}"#, "network = -3"),
+            (r#"{"keep":0}"#, "keep = 0 is not between"),
+            (r#"{"memory":1024}"#, "memory = 1024 is not between"),
             (
                 r#"{"requests":3}"#,
                 "requests = 3 is not between 10 and 10000",
             ),
             (r#"{"rate":5,"fast":true}"#, "exclude each other"),
+            (r#"{"own":true,"cpus":[1]}"#, "exclude each other"),
             (r#"{"source":"live"}"#, "needs the robot"),
             (r#"{"robot":"r1"}"#, "with live alone"),
             (r#"{"limits":[1]}"#, "`limits`"),

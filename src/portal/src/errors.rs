@@ -521,6 +521,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
+        C::OutOfMemory { .. } => (S::UNPROCESSABLE_ENTITY, "out-of-memory", "out of memory"),
         C::Calibration(_)
         | C::Shadow(_)
         | C::Reach(reach::Error::Trial(_) | reach::Error::Linked(_)) => {

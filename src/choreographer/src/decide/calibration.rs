@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use api::calibration::{Point, TimeSpread};
+use api::calibration::{Point, TimeSpread, rounded_up};
 use api::dictionary::{Row, Spread};
 use api::{Limits, Measure, Size};
 
@@ -143,16 +143,6 @@ fn keeps(point: &Point, pace: Option<f64>) -> bool {
 pub(crate) fn with_margin(peak: Size) -> Size {
     let margin = (peak.0 / 100 * MARGIN).max(LEAST_MARGIN);
     Size((peak.0 + margin).next_multiple_of(1 << 20))
-}
-
-/// To two digits, never down.
-fn rounded_up(milliseconds: f64) -> f64 {
-    // A time of nothing is none that anybody could ask for.
-    let milliseconds = milliseconds.max(1e-3);
-    let digit = 10f64.powf(milliseconds.log10().floor() - 1.0);
-    let up = (milliseconds / digit).ceil() * digit;
-    // What powers of ten left behind the digits.
-    (up * 1e6).round() / 1e6
 }
 
 #[cfg(test)]

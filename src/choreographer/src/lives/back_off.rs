@@ -103,6 +103,8 @@ impl Inner {
         let robot = key(&handle.robot, handle.anonymous);
         let ready_for = handle.ready_for();
         let reason = match outcome {
+            // With so little memory it was measured, and robots are given more.
+            Err(_) if handle.was_out_of_memory() && handle.gives_way() => return,
             Err(Failure::Broken { reason, .. }) => reason,
             Ok(_) if ready_for.is_some_and(|time| time >= RECOVERED) => {
                 return self.back_offs.recovered(service, robot);

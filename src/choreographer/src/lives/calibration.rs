@@ -9,6 +9,7 @@ use api::trial::Fed;
 use reach::{Gap, Material, Pace, Reach, Replay};
 use servant::engine::Servant;
 use tokio::sync::mpsc;
+use tokio::time::timeout;
 
 use crate::decide::Amount;
 use crate::decide::calibration::{self as decide, Next};
@@ -74,13 +75,17 @@ impl Choreographer {
             &requests.material,
             options.input.as_deref(),
         )?;
-        let measured = self.measured(service, PURPOSE)?;
-        let gave_way = |error| match measured.lease.handle().gave_way() {
-            true => Error::Calibration(format!(
+        let stated = api::Stated {
+            memory: options.memory,
+            ..api::Stated::default()
+        };
+        let measured = self.measured(service, PURPOSE, stated)?;
+        let gave_way = |error| match measured.lease.handle() {
+            handle if handle.gave_way() => Error::Calibration(format!(
                 "measuring {service} was given up before it came to anything: {GAVE_WAY}; calibrate on a machine with more room, \
                  or name smaller limits with --cpus"
             )),
-            false => error,
+            handle => out_of_memory(handle).unwrap_or(error),
         };
         step(format!("starting a servant of {service} to measure")).await;
         measured.lease.admitted().await.map_err(gave_way)?;
@@ -91,6 +96,7 @@ impl Choreographer {
             measured: &measured,
             reach: &*reach,
             pace: pace(options),
+            own: options.own,
             aux: options.aux.clone(),
             sum: Calibration {
                 service: service.to_owned(),
@@ -100,7 +106,7 @@ impl Choreographer {
                 ..Calibration::default()
             },
         };
-        let named = !options.cpus.is_empty();
+        let named = options.own || !options.cpus.is_empty();
         loop {
             let cpus = match decide::next(&ladder, named, &measuring.sum.points) {
                 Next::Measure(cpus) => cpus,
@@ -111,8 +117,12 @@ impl Choreographer {
             };
             step(format!("measuring with {cpus} cores")).await;
             match measuring.at(cpus, &requests.material).await {
-                Ok(point) => {
-                    let _ = events.send(CalibrationEvent::Measured { point }).await;
+                Ok((point, mut times)) => {
+                    if !options.times {
+                        times.clear();
+                    }
+                    let event = CalibrationEvent::Measured { point, times };
+                    let _ = events.send(event).await;
                 }
                 Err(error) if measuring.sum.points.is_empty() => return Err(gave_way(error)),
                 Err(_) if measured.lease.handle().gave_way() => {
@@ -127,7 +137,17 @@ impl Choreographer {
                 Err(error) => return Err(error),
             }
         }
-        Ok(measuring.proposed())
+        let calibration = measuring.proposed();
+        if let Some(seconds) = options.keep {
+            let kept = CalibrationEvent::Kept {
+                servant: measured.lease.handle().id.clone(),
+                calibration: Box::new(calibration.clone()),
+            };
+            let _ = events.send(kept).await;
+            // Whoever asked ends it sooner, by which this is dropped.
+            let _ = timeout(Duration::from_secs_f64(seconds), measured.lease.over()).await;
+        }
+        Ok(calibration)
     }
 
     /// At which limits it is measured: those that are named, else up to all that can be promised to it now.
@@ -136,6 +156,11 @@ impl Choreographer {
         measured: &Measured,
         options: &CalibrationOptions,
     ) -> Result<Vec<f64>, Error> {
+        if options.own {
+            let container = measured.lease.handle().container();
+            let enforced = container.and_then(|container| container.enforced().limits.cpus);
+            return Ok(vec![enforced.unwrap_or(self.inner.options.cores)]);
+        }
         if !options.cpus.is_empty() {
             let mut named = options.cpus.clone();
             named.sort_by(f64::total_cmp);
@@ -163,25 +188,30 @@ struct Measuring<'a> {
     measured: &'a Measured,
     reach: &'a dyn Reach,
     pace: Pace,
+    /// Its limits stay.
+    own: bool,
     aux: BTreeMap<String, String>,
     sum: Calibration,
 }
 
 impl Measuring<'_> {
-    /// Measures at one limit, and notes it.
-    async fn at(&mut self, cpus: f64, material: &Material) -> Result<Point, Error> {
+    /// Measures at one limit, and notes it; also the times of the requests that were answered, in milliseconds.
+    async fn at(&mut self, cpus: f64, material: &Material) -> Result<(Point, Vec<f64>), Error> {
         let handle = self.measured.lease.handle();
-        let change = api::Limits {
-            cpus: Some(cpus),
-            ..api::Limits::default()
-        };
-        self.choreographer.set_limits(&handle.id, change).await?;
+        if !self.own {
+            let change = api::Limits {
+                cpus: Some(cpus),
+                ..api::Limits::default()
+            };
+            self.choreographer.set_limits(&handle.id, change).await?;
+        }
         let container = handle
             .container()
             .ok_or(Error::Internal("measuring a servant"))?;
+        let own = self.own;
         let in_force = || {
             let enforced = container.enforced().limits.cpus;
-            Amount::new(enforced.unwrap_or(0.0), 0) == Amount::new(cpus, 0)
+            own || Amount::new(enforced.unwrap_or(0.0), 0) == Amount::new(cpus, 0)
         };
         if !in_force() {
             return Err(Error::Calibration(format!(
@@ -198,6 +228,10 @@ impl Measuring<'_> {
             replay = self.reach.replay(&self.sum.service, interface, material, &self.pace) => replay?,
             never = watch(&*container, &mut memory) => match never {},
         };
+        // A node that is started again by itself does not end its servant.
+        if let Some(error) = out_of_memory(handle) {
+            return Err(error);
+        }
         if !in_force() {
             return Err(Error::Calibration(format!(
                 "somebody has changed the limits of servant {} while it was measured; calibrate again",
@@ -219,8 +253,9 @@ impl Measuring<'_> {
             rate: replay.rate,
             memory: Size(memory),
         };
+        let times = milliseconds(&replay);
         self.note(point, replay);
-        Ok(point)
+        Ok((point, times))
     }
 
     fn note(&mut self, point: Point, replay: Replay) {
@@ -249,6 +284,16 @@ impl Measuring<'_> {
         sum.rows = decide::propose(&sum.points, sum.pace, network, memory, &self.aux);
         sum
     }
+}
+
+/// What to say of a servant that was ended by the kernel for want of memory.
+fn out_of_memory(handle: &Handle) -> Option<Error> {
+    let memory = handle.limits().memory?;
+    handle.was_out_of_memory().then(|| Error::OutOfMemory {
+        service: handle.service().to_owned(),
+        memory,
+        ready: handle.ready_for().is_some(),
+    })
 }
 
 fn pace(options: &CalibrationOptions) -> Pace {

@@ -40,7 +40,8 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     inner.retire(&handle);
     inner.note_end(&handle, &outcome);
     inner.rollouts.note_gone(&handle);
-    if matches!(outcome, Err(Failure::Broken { .. })) && !handle.is_candidate() {
+    let starved = handle.was_out_of_memory() && handle.gives_way();
+    if matches!(outcome, Err(Failure::Broken { .. })) && !handle.is_candidate() && !starved {
         inner.rollouts.note_servant(&handle, true);
     }
     let outcome = match outcome {

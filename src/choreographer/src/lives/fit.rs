@@ -94,6 +94,7 @@ impl Choreographer {
             free_memory: api::Size(free.memory),
             waiting,
             stalled: book.stalled().map(str::to_owned),
+            never: book.check(wanted).err().map(|refused| refused.to_string()),
             full: book.full().filter(|_| !fit.now).is_some(),
             now: fit.now,
             ends: fit.ends,

@@ -102,6 +102,8 @@ pub struct Handle {
     idle_until: AtomicU64,
     /// Its nodes are started and ended by a robot's stubs.
     linked: AtomicBool,
+    /// The kernel has ended one of its nodes for want of memory.
+    out_of_memory: AtomicBool,
     down: Mutex<Vec<api::NodeDown>>,
     /// What of its nodes hangs, in words, by who uses them.
     hung: Mutex<BTreeMap<String, String>>,
@@ -144,6 +146,7 @@ impl Handle {
             began: Instant::now(),
             idle_until: AtomicU64::new(0),
             linked: AtomicBool::new(false),
+            out_of_memory: AtomicBool::new(false),
             down: Mutex::default(),
             hung: Mutex::default(),
             starts: Mutex::default(),
@@ -152,6 +155,16 @@ impl Handle {
             container: OnceLock::new(),
             reach: Mutex::default(),
         }
+    }
+
+    /// The kernel has ended one of its nodes for want of memory.
+    pub(crate) fn note_out_of_memory(&self) {
+        self.out_of_memory.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the kernel has ended one of its nodes for want of memory.
+    pub(crate) fn was_out_of_memory(&self) -> bool {
+        self.out_of_memory.load(Ordering::Relaxed)
     }
 
     /// Its service.

@@ -142,6 +142,9 @@ impl<'a> Nodes<'a> {
             }
             NodeEvent::Started { node } => return self.handle.note_start(&node),
         };
+        if exit.out_of_memory {
+            self.handle.note_out_of_memory();
+        }
         let respawns = self.handle.revision.plan.nodes.iter();
         if respawns
             .filter(|one| one.respawn)
@@ -160,6 +163,9 @@ impl<'a> Nodes<'a> {
     ) -> Result<(), Failure> {
         // The engine lost it: the container's own state says why.
         let Ok(exit) = exit else { return Ok(()) };
+        if exit.out_of_memory {
+            self.handle.note_out_of_memory();
+        }
         let how = how_it_ended(&exit, &self.handle.limits());
         let crew = Crew {
             linked: self.handle.is_linked(),

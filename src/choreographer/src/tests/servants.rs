@@ -387,3 +387,32 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     next.stop("the test is over", |_| true).await;
     assert!(world.engine.servants().is_empty());
 }
+
+#[tokio::test(start_paused = true)]
+async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
+    let world = World::new();
+    world.engine.program("/eats", |process| async move {
+        process.allocate(100 << 20).await;
+        process.advertise("/greeting", "std_msgs/String");
+        std::future::pending::<i32>().await
+    });
+    world.publish("greet", "/eats", |_| {});
+    let daemon = world.daemon();
+    let little = api::Stated {
+        memory: Some(api::Size(50 << 20)),
+        ..api::Stated::default()
+    };
+    // As often as would make a robot without a name wait.
+    for _ in 0..5 {
+        let measured = daemon.measured("greet", "calibrate", little.clone());
+        let measured = measured.expect("it is not held up");
+        let reason = failure(&measured.lease).await;
+        assert!(reason.contains("50M"), "{reason}");
+        assert!(measured.lease.handle().was_out_of_memory());
+    }
+    assert!(daemon.back_offs().is_empty());
+    let nameless = ServantRequest::new("greet", "~abc").anonymous();
+    let lease = daemon.ensure(nameless).expect("a lease");
+    lease.ready().await.expect("it has all memory");
+    assert!(!lease.handle().was_out_of_memory());
+}

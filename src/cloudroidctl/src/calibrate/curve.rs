@@ -6,17 +6,17 @@ use std::fmt::Write;
 use api::Calibration;
 use api::calibration::{Point, TimeSpread};
 
-const WIDTH: f64 = 640.0;
-const HEIGHT: f64 = 360.0;
+pub(crate) const WIDTH: f64 = 640.0;
+pub(crate) const HEIGHT: f64 = 360.0;
 /// Around the panel: left, top, and what is left for labels on the right and below.
-const LEFT: f64 = 70.0;
-const TOP: f64 = 50.0;
-const RIGHT: f64 = 30.0;
-const BOTTOM: f64 = 50.0;
-const BLUE: &str = "#0a6ebd";
+pub(crate) const LEFT: f64 = 70.0;
+pub(crate) const TOP: f64 = 50.0;
+pub(crate) const RIGHT: f64 = 30.0;
+pub(crate) const BOTTOM: f64 = 50.0;
+pub(crate) const BLUE: &str = "#0a6ebd";
 
 /// A logarithmic axis from one value to another, over a stretch of the picture.
-struct Axis {
+pub(crate) struct Axis {
     from: f64,
     to: f64,
     start: f64,
@@ -25,7 +25,7 @@ struct Axis {
 
 impl Axis {
     /// That shows all `values`, with some room around.
-    fn around(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Axis {
+    pub(crate) fn around(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Axis {
         let positive = values.filter(|value| value.is_finite() && *value > 0.0);
         let (least, most) = positive.fold((f64::INFINITY, 0.0f64), |(least, most), value| {
             (least.min(value), most.max(value))
@@ -43,13 +43,14 @@ impl Axis {
         }
     }
 
-    fn at(&self, value: f64) -> f64 {
+    /// Where a value stands.
+    pub(crate) fn at(&self, value: f64) -> f64 {
         let share = (value.max(self.from) / self.from).ln() / (self.to / self.from).ln();
         self.start + (self.end - self.start) * share
     }
 
     /// 1, 2 and 5 times the powers of ten that it shows.
-    fn ticks(&self) -> Vec<f64> {
+    pub(crate) fn ticks(&self) -> Vec<f64> {
         let powers = self.from.log10().floor() as i32..=self.to.log10().ceil() as i32;
         powers
             .flat_map(|power| [1.0, 2.0, 5.0].map(|digit| digit * 10f64.powi(power)))
@@ -182,11 +183,12 @@ fn band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)])
 }
 
 /// Without what powers of ten leave behind the digits.
-fn number(value: f64) -> String {
+pub(crate) fn number(value: f64) -> String {
     ((value * 1e6).round() / 1e6).to_string()
 }
 
-fn text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
+/// Words at a place; `anchor` as SVG has it.
+pub(crate) fn text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
     let words = words
         .replace('&', "&amp;")
         .replace('<', "&lt;")
@@ -197,7 +199,8 @@ fn text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
     );
 }
 
-fn put(out: &mut String, line: std::fmt::Arguments) {
+/// One more line of the picture.
+pub(crate) fn put(out: &mut String, line: std::fmt::Arguments) {
     // Writing to a String does not fail.
     let _ = writeln!(out, "{line}");
 }

@@ -226,6 +226,9 @@ fn next_of_choreographer(error: &choreographer::Error) -> String {
         C::Rollout(_) => {
             "see the service's revisions with: cloudroidctl services NAME, and how it comes to the next one with: cloudroidctl rollout NAME".into()
         }
+        C::OutOfMemory { .. } => {
+            "measure it with more memory, or outsource it: no robot with so little can run it".into()
+        }
         C::Calibration(_) | C::Shadow(_) => "do what it says, and begin again".into(),
         C::Catalogue(error) => next_of_catalogue(error),
         C::State(error) => next_of_state(error).into(),

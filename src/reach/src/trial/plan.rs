@@ -140,9 +140,13 @@ impl<'a> Plan<'a> {
                     }
                 }
                 if plan.items.is_empty() {
-                    return Err(nothing(
-                        "no topic of the recording is an input of the service",
-                    ));
+                    return Err(nothing(&match plan.unused.is_empty() {
+                        true => "the recording holds no message".to_owned(),
+                        false => format!(
+                            "no topic of the recording is an input of the service (it has {})",
+                            plan.unused.join(", ")
+                        ),
+                    }));
                 }
                 plan.choose(request)
                     .ok_or_else(|| unfed(request, &nothing))?;
@@ -313,7 +317,10 @@ mod tests {
             error.map(|error| error.to_string()).unwrap_or_default()
         };
         let text = refused(recorded("/tf", "tf2_msgs/TFMessage", "x"), None);
-        assert!(text.contains("/name (std_msgs/String)"), "{text}");
+        assert!(
+            text.contains("it has /tf); its inputs are: /name (std_msgs/String)"),
+            "{text}"
+        );
         let text = refused(recorded("/name", "std_msgs/String", "other"), None);
         assert!(text.contains("recorded with another definition"), "{text}");
         let text = refused(recorded("/name", "std_msgs/String", STRING), Some("/count"));

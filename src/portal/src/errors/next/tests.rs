@@ -204,6 +204,11 @@ fn of_servants() -> Vec<Error> {
         C::NoRollout(x()),
         C::Rollout(x()),
         C::Ending,
+        C::OutOfMemory {
+            service: x(),
+            memory: api::Size(1),
+            ready: true,
+        },
         C::Calibration(x()),
         C::Shadow(x()),
         C::Reach(reach::Error::Elsewhere(x())),

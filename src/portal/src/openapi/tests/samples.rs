@@ -532,6 +532,10 @@ fn calibration_options() -> CalibrationOptions {
         input: some("/x"),
         network: Some(1.5),
         aux: [("image".to_owned(), "640x480".to_owned())].into(),
+        memory: Some(Size(1 << 30)),
+        own: true,
+        times: true,
+        keep: Some(60.0),
     }
 }
 
@@ -582,6 +586,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         free_memory: Size(1),
         waiting: 1,
         stalled: some("it swaps"),
+        never: some("x"),
         full: false,
         now: false,
         ends: all("x"),
@@ -608,6 +613,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     };
     let bare = Fit {
         stalled: None,
+        never: None,
         more: None,
         expected: None,
         shared: None,
@@ -828,6 +834,11 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         CalibrationEvent::Step { title: "x".into() },
         CalibrationEvent::Measured {
             point: Point::default(),
+            times: vec![1.5],
+        },
+        CalibrationEvent::Kept {
+            servant: "x".into(),
+            calibration: Box::default(),
         },
         CalibrationEvent::Done {
             calibration: Box::new(calibration()),

@@ -1,0 +1,376 @@
+//! Asks a servant over the network that lies between here and the daemon, as a robot does: requests and answers are the bytes that
+//! they are, in a WebSocket of the portal. Which input each recorded topic goes to, the daemon has said when it replayed the same.
+
+use std::collections::{BTreeMap, HashMap};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use api::interface::Direction;
+use api::{Calibration, ServiceDetail};
+use bytes::Bytes;
+use foxglove::ws_protocol::client::advertise::Channel;
+use foxglove::ws_protocol::client::{Advertise, MessageData, Subscribe, Subscription};
+use foxglove::ws_protocol::schema::Schema;
+use foxglove::ws_protocol::server::ServerMessage;
+use ros::bag::Recorded;
+use ros::codec::{Time, header_stamp};
+use ros::schema::Registry;
+use tokio::time::{Instant, timeout_at};
+
+use crate::client::{Client, escaped};
+use crate::inside::{self, ENCODING, Inside};
+use crate::output;
+
+/// So much of a recording is used, as by the daemon.
+pub const RECORDED: usize = 300;
+/// Requests where nobody says how many, as with the daemon.
+pub const REQUESTS: usize = 40;
+/// How long an answer is waited for, and how long all may take.
+const ANSWER: Duration = Duration::from_secs(10);
+const WHOLE: Duration = Duration::from_secs(60);
+/// So many requests in vain, one after the other, are enough.
+const IN_VAIN: usize = 3;
+/// Longer pauses of a recording are cut to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+/// Messages of a topic that wait in the daemon.
+const DEPTH: usize = 16;
+
+/// What came of it.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Asked {
+    /// Times of the requests in milliseconds, from here to here; none of those that were not answered. The first request is not among
+    /// them.
+    pub times: Vec<Option<f64>>,
+    /// Bytes of the largest request.
+    pub request: usize,
+    /// Bytes of the largest answer.
+    pub answer: usize,
+}
+
+/// What is asked.
+pub struct Probe<'a> {
+    /// The service.
+    pub service: &'a ServiceDetail,
+    /// What the daemon has measured with the same recording.
+    pub calibration: &'a Calibration,
+    /// The recording.
+    pub recorded: &'a [Recorded],
+    /// The input whose messages are the requests; none: the first that the recording feeds.
+    pub input: Option<&'a str>,
+    /// Each request follows the answer before it.
+    pub fast: bool,
+    /// Requests whose times are wanted.
+    pub requests: usize,
+}
+
+/// Definitions of a service's types.
+#[derive(serde::Deserialize)]
+struct Definitions {
+    definitions: BTreeMap<String, String>,
+}
+
+impl Probe<'_> {
+    /// Asks, and waits for the answers.
+    pub async fn ask(&self, client: &Client, servant: &str) -> anyhow::Result<Asked> {
+        let name = escaped(&self.calibration.service);
+        let path = format!("/api/v1/services/{name}/interface");
+        let Definitions { definitions } = client.get(&path).await?;
+        let registry = Registry::from_definitions(&definitions)
+            .with_context(|| format!("a definition of {}", self.calibration.service))?;
+        let round = Round::of(self.calibration, self.recorded, self.input, self.fast);
+        if round.items.is_empty() {
+            bail!(
+                "nothing of the recording goes to an input of {}",
+                self.calibration.service
+            );
+        }
+        let mut line = Line {
+            inside: Inside::attach(client, servant, DEPTH).await?,
+            service: self.service,
+            registry,
+            outputs: HashMap::new(),
+            answering: None,
+        };
+        line.open(self.calibration).await?;
+        self.asks(&mut line, &round).await
+    }
+
+    async fn asks(&self, line: &mut Line<'_>, round: &Round) -> anyhow::Result<Asked> {
+        let mut asked = Asked::default();
+        let ends = Instant::now() + WHOLE;
+        let mut began = Instant::now();
+        let (mut warm, mut in_vain) = (false, 0);
+        for turn in 0.. {
+            let now = Instant::now();
+            if asked.times.len() >= self.requests || in_vain >= IN_VAIN || now >= ends {
+                break;
+            }
+            let item = &round.items[turn % round.items.len()];
+            let lap = u32::try_from(turn / round.items.len())?;
+            let due = began + round.length * lap + item.at;
+            // Of time that was lost, no more is made up for than lies between two requests.
+            began += now
+                .saturating_duration_since(due)
+                .saturating_sub(round.gap());
+            line.wait(due).await?;
+            let since = Instant::now();
+            line.publish(item).await?;
+            if item.input != round.request {
+                continue;
+            }
+            asked.request = asked.request.max(item.bytes.len());
+            let stamp = line.stamp(&self.calibration.inputs[item.input].type_name, &item.bytes);
+            let answer = line.answer(stamp, since + ANSWER).await?;
+            in_vain = if answer.is_some() { 0 } else { in_vain + 1 };
+            if let Some((_, bytes)) = answer {
+                asked.answer = asked.answer.max(bytes);
+            }
+            // Until one was answered, topics are being connected.
+            if warm {
+                let took = answer.map(|(at, _)| (at - since).as_secs_f64() * 1000.0);
+                asked.times.push(took);
+            }
+            warm |= answer.is_some();
+        }
+        Ok(asked)
+    }
+}
+
+/// The recording's messages that go to an input, once.
+struct Round {
+    items: Vec<Item>,
+    /// Number of the input whose messages are requests.
+    request: usize,
+    /// From the first message to the first of the next round.
+    length: Duration,
+}
+
+struct Item {
+    /// Number among the inputs that the daemon has fed.
+    input: usize,
+    at: Duration,
+    bytes: Bytes,
+}
+
+impl Round {
+    fn of(
+        calibration: &Calibration,
+        recorded: &[Recorded],
+        request: Option<&str>,
+        fast: bool,
+    ) -> Round {
+        let inputs = &calibration.inputs;
+        let mut round = Round {
+            items: Vec::new(),
+            request: request
+                .and_then(|named| inputs.iter().position(|input| input.topic == named))
+                .unwrap_or_default(),
+            length: Duration::ZERO,
+        };
+        let mut before = None;
+        for message in recorded {
+            let goes = inputs.iter().position(|input| {
+                let topic = &*message.topic;
+                input.type_name == message.wire_type.name
+                    && (input.topic == topic || input.from.iter().any(|from| from == topic))
+            });
+            let Some(input) = goes else { continue };
+            if !fast {
+                let pause = message.time.saturating_sub(before.unwrap_or(message.time));
+                round.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
+                before = Some(message.time.max(before.unwrap_or(0)));
+            }
+            round.items.push(Item {
+                input,
+                at: round.length,
+                bytes: message.bytes.clone(),
+            });
+        }
+        if let Some(pauses) = u32::try_from(round.items.len()).ok().filter(|n| *n > 1) {
+            round.length += round.length / (pauses - 1);
+        }
+        round
+    }
+
+    /// Between two requests.
+    fn gap(&self) -> Duration {
+        let requests = self.items.iter().filter(|item| item.input == self.request);
+        self.length / u32::try_from(requests.count().max(1)).unwrap_or(u32::MAX)
+    }
+}
+
+/// The connection to the servant.
+struct Line<'a> {
+    inside: Inside,
+    service: &'a ServiceDetail,
+    registry: Registry,
+    /// Types of outputs that are listened to, by subscription.
+    outputs: HashMap<u32, String>,
+    /// The output whose messages answer requests that have no stamp.
+    answering: Option<u32>,
+}
+
+impl Line<'_> {
+    /// Listens to the outputs, and advertises the inputs.
+    async fn open(&mut self, calibration: &Calibration) -> anyhow::Result<()> {
+        // The daemon tells which topics there are as soon as one has come.
+        let deadline = Instant::now() + ANSWER;
+        while self.outputs.is_empty() {
+            if Instant::now() >= deadline {
+                bail!(
+                    "nothing of {} is published where it could be heard from here",
+                    calibration.service
+                );
+            }
+            self.heard(deadline).await?;
+        }
+        for (number, input) in (0..).zip(&calibration.inputs) {
+            let schema = Schema::new(&*input.type_name, "ros1msg", &b""[..]);
+            let told = Channel::builder(number, &*input.topic, ENCODING).with_schema(schema);
+            self.inside.send(&Advertise::new([told.build()?])).await?;
+        }
+        Ok(())
+    }
+
+    async fn publish(&mut self, item: &Item) -> anyhow::Result<()> {
+        let message = MessageData::new(u32::try_from(item.input)?, &item.bytes[..]);
+        self.inside.send(&message).await
+    }
+
+    fn stamp(&self, type_name: &str, bytes: &[u8]) -> Option<Time> {
+        header_stamp(&*self.registry.message(type_name).ok()?, bytes)
+    }
+
+    /// Until then, what comes answers nothing; also what has come by now.
+    async fn wait(&mut self, due: Instant) -> anyhow::Result<()> {
+        while self.next(due).await?.is_some() {}
+        Ok(())
+    }
+
+    /// When the answer came, and its bytes: the first output with the request's stamp, or, where either has none, the next on the
+    /// topic that answered the first request.
+    async fn answer(
+        &mut self,
+        asked: Option<Time>,
+        deadline: Instant,
+    ) -> anyhow::Result<Option<(Instant, usize)>> {
+        loop {
+            let Some(heard) = self.next(deadline).await? else {
+                return Ok(None);
+            };
+            let Some((number, at, bytes)) = heard else {
+                continue;
+            };
+            let stamp = self.outputs.get(&number);
+            let stamp = stamp.and_then(|type_name| self.stamp(type_name, &bytes));
+            let answers = match (asked, stamp) {
+                (Some(asked), Some(stamp)) => asked == stamp,
+                _ => *self.answering.get_or_insert(number) == number,
+            };
+            if answers {
+                return Ok(Some((at, bytes.len())));
+            }
+        }
+    }
+
+    async fn heard(&mut self, deadline: Instant) -> anyhow::Result<()> {
+        self.next(deadline).await.map(drop)
+    }
+
+    /// The next that comes until then; none when it is time. Within it, a message of an output.
+    async fn next(
+        &mut self,
+        deadline: Instant,
+    ) -> anyhow::Result<Option<Option<(u32, Instant, Vec<u8>)>>> {
+        let Ok(message) = timeout_at(deadline, self.inside.next()).await else {
+            return Ok(None);
+        };
+        let at = Instant::now();
+        let Some(message) = message? else {
+            bail!("the measured servant has ended while it was asked over the network")
+        };
+        match inside::read(&message) {
+            Some(ServerMessage::MessageData(told)) => {
+                return Ok(Some(Some((told.subscription_id, at, told.data.to_vec()))));
+            }
+            Some(ServerMessage::Advertise(told)) => {
+                for channel in told.channels {
+                    self.listen(channel.id, &channel.topic).await?;
+                }
+            }
+            Some(ServerMessage::Status(told)) => output::complain(&told.message),
+            _ => {}
+        }
+        Ok(Some(None))
+    }
+
+    async fn listen(&mut self, channel: u64, topic: &str) -> anyhow::Result<()> {
+        // Latched outputs tell a state; they answer nothing.
+        let output = self.service.interface.topics.iter().find(|known| {
+            known.direction == Direction::Output && !known.latched && known.name == *topic
+        });
+        let Some(output) = output else { return Ok(()) };
+        let number = u32::try_from(self.outputs.len())? + 1;
+        self.outputs.insert(number, output.type_name.clone());
+        let wanted = Subscribe::new([Subscription::new(number, channel)]);
+        self.inside.send(&wanted).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use api::trial::Fed;
+    use ros::bus::WireType;
+
+    use super::*;
+
+    fn recorded(topic: &str, type_name: &str, millis: u64) -> Recorded {
+        Recorded {
+            topic: topic.into(),
+            wire_type: Arc::new(WireType::new(type_name, "x", "")),
+            time: millis * 1_000_000,
+            bytes: Bytes::from_static(b"\0\0\0\0"),
+        }
+    }
+
+    fn fed(topic: &str, type_name: &str, from: &[&str]) -> Fed {
+        Fed {
+            topic: topic.into(),
+            type_name: type_name.into(),
+            sent: 1,
+            from: from.iter().map(|topic| (*topic).to_owned()).collect(),
+        }
+    }
+
+    #[test]
+    fn recorded_messages_go_where_the_daemon_sent_them_at_their_pace() {
+        let calibration = Calibration {
+            inputs: vec![
+                fed("/say", "std_msgs/String", &["/chatter"]),
+                fed("/count", "std_msgs/Int32", &[]),
+            ],
+            ..Calibration::default()
+        };
+        let bag = [
+            recorded("/chatter", "std_msgs/String", 1000),
+            recorded("/tf", "tf2_msgs/TFMessage", 1050),
+            recorded("/count", "std_msgs/Int32", 1100),
+            // After a minute of nothing.
+            recorded("/chatter", "std_msgs/String", 61_100),
+        ];
+        let round = Round::of(&calibration, &bag, Some("/count"), false);
+        let told: Vec<(usize, u128)> = round
+            .items
+            .iter()
+            .map(|item| (item.input, item.at.as_millis()))
+            .collect();
+        assert_eq!(told, [(0, 0), (1, 100), (0, 1100)]);
+        assert_eq!((round.request, round.length.as_millis()), (1, 1650));
+        assert_eq!(round.gap().as_millis(), 1650);
+        let fast = Round::of(&calibration, &bag, None, true);
+        assert_eq!((fast.request, fast.length), (0, Duration::ZERO));
+        assert!(fast.items.iter().all(|item| item.at.is_zero()));
+    }
+}

@@ -1,0 +1,333 @@
+//! A user evaluates a package of theirs: native as on a small robot, against outsourced over the network.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::Value;
+use support::Verdict;
+use support::binaries;
+use support::daemon::Daemon;
+use support::deployer::{path_str, run};
+use support::machine::Machine;
+use support::world::{ADDER, PEOPLE, TELLER, world};
+
+use crate::access;
+use crate::calibration::{PEDESTRIANS, none_is_left};
+
+/// Recordings in a machine with ROS: pictures of people, words, and an end.
+struct Recordings {
+    machine: Machine,
+}
+
+impl Recordings {
+    fn new() -> anyhow::Result<Recordings> {
+        let machine = Machine::new()?;
+        let place = world().directory("pictures")?;
+        let raw = place.path().join("raw");
+        run(Command::new("ffmpeg")
+            .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", "5"])
+            .args(["-s", "640x480", "-pix_fmt", "rgb24", "-f", "rawvideo"])
+            .arg(&raw))?
+        .succeeded()?;
+        machine.puts(&raw, "/root/raw", 0o644)?;
+        let records = r#"
+import rosbag, rospy, struct
+from std_msgs.msg import Int32, String
+
+class Image:
+    """What the machine has no package of."""
+    _type = "sensor_msgs/Image"
+    _md5sum = "060021388200f6f0f447d0fcd9c64743"
+    _full_text = "Header header"
+
+def picture(number, pixels):
+    text = lambda words: struct.pack("<I", len(words)) + words
+    return (struct.pack("<III", number, 1000, number * 100000000) + text(b"camera") + struct.pack("<II", 480, 640)
+        + text(b"rgb8") + struct.pack("<BI", 0, 640 * 3) + text(pixels))
+
+with open("/root/raw", "rb") as file, rosbag.Bag("/root/people.bag", "w") as bag:
+    for number in range(5):
+        message = (Image._type, picture(number, file.read(640 * 480 * 3)), Image._md5sum, 0, Image)
+        bag.write("/camera", message, rospy.Time(1000, number * 100000000), raw=True)
+with rosbag.Bag("/root/words.bag", "w") as bag:
+    for number in range(12):
+        bag.write("/chatter", String("word %d" % number), rospy.Time(1000, number * 50000000))
+with rosbag.Bag("/root/end.bag", "w") as bag:
+    for number in range(12):
+        bag.write("/end", Int32(1), rospy.Time(1000, number * 50000000))
+"#;
+        machine
+            .runs("sh", &format!("python3 - << 'END'\n{records}END"))?
+            .succeeded()?;
+        Ok(Recordings { machine })
+    }
+
+    fn of(&self, what: &str) -> PathBuf {
+        self.machine.written(&format!("/root/{what}.bag"))
+    }
+}
+
+fn number(value: &Value, path: &str) -> anyhow::Result<f64> {
+    value
+        .pointer(path)
+        .and_then(Value::as_f64)
+        .with_context(|| format!("{path} of {value:#}"))
+}
+
+fn evaluates(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Value> {
+    let bag = ["eval", PEOPLE.name, "--bag", path_str(bag), "--fast"];
+    daemon.deployer().asks(&[&bag, words].concat())
+}
+
+pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
+    // Cores that it measures with are not promised to other stories' robots.
+    let daemon = world().own("evaluated").start()?;
+    let pushed = [&["push"], PEOPLE.arguments].concat();
+    daemon.deployer().types(&pushed)?.succeeded()?;
+    let recordings = Recordings::new()?;
+    let place = world().directory("evaluation")?;
+    let plot = place.path().join("plot.svg");
+    let plot = ["--plot", path_str(&plot)];
+    let words = [
+        "--requests",
+        "12",
+        "--cpus",
+        "1",
+        "--network",
+        "20",
+        "--yes",
+    ];
+    let found = evaluates(
+        &daemon,
+        &recordings.of("people"),
+        &[&words[..], &plot].concat(),
+    )?;
+    none_is_left(&daemon, PEOPLE.name)?;
+    for side in ["native", "outsourced"] {
+        ensure!(found[side]["answered"] == 12, "{side}: {found:#}");
+        ensure!(
+            found[side]["times"].as_array().map(Vec::len) == Some(12),
+            "{side}: {found:#}"
+        );
+    }
+    ensure!(
+        found["native"]["cpus"] == 0.25 && found["outsourced"]["cpus"] == 1.0,
+        "{found:#}"
+    );
+    ensure!(found["native"]["memory_limit"] == 1u64 << 30, "{found:#}");
+    // A quarter of a core takes longer than a whole one, and the limit says so.
+    let held_up = |side: &str| number(&found, &format!("/{side}/phases/held_up"));
+    ensure!(held_up("native")? > held_up("outsourced")?, "{found:#}");
+    ensure!(number(&found, "/times_as_fast")? > 1.1, "{found:#}");
+    let verdict = found["verdict"].as_str().unwrap_or_default();
+    ensure!(verdict.starts_with("worth it: outsourced"), "{verdict}");
+    // Half of the network up, half down; and what was measured lies below.
+    ensure!(
+        number(&found, "/outsourced/phases/up")? == 10.0,
+        "{found:#}"
+    );
+    let part = |name: &str| number(&found, &format!("/outsourced/phases/{name}"));
+    let parts = part("up")? + part("transport")? + part("compute")? + part("down")?;
+    let median = number(&found, "/outsourced/rrt/p50")?;
+    ensure!(
+        (parts - median).abs() < 1e-6,
+        "{parts} is not {median}: {found:#}"
+    );
+    // The picture went over the network as it is.
+    ensure!(
+        number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0,
+        "{found:#}"
+    );
+    let (desire, p95) = (
+        number(&found, "/sla/desire")?,
+        number(&found, "/outsourced/rrt/p95")?,
+    );
+    ensure!((p95..p95 * 1.1).contains(&(desire * 1000.0)), "{found:#}");
+    let rows = daemon.deployer().asks(&["sla", "list", PEOPLE.name])?;
+    ensure!(rows.as_array().map(Vec::len) == Some(1), "{rows:#}");
+    ensure!(rows[0]["value"] == found["sla"]["desire"], "{rows:#}");
+    let drawn = std::fs::read_to_string(plot[1])?;
+    for class in ["class=\"native\"", "class=\"outsourced\""] {
+        ensure!(drawn.contains(class), "{class}: {drawn}");
+    }
+    too_little_memory(&daemon, &recordings, plot[1])?;
+    deployers_evaluate_what_is_theirs(&daemon, &recordings, plot[1])
+}
+
+/// That is an answer, and robots are given servants as before.
+fn too_little_memory(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Verdict {
+    let words = ["--requests", "12", "--robot-memory", "24M", "--plot", plot];
+    let found = evaluates(daemon, &recordings.of("people"), &words)?;
+    let told = found["native"]["out_of_memory"]
+        .as_str()
+        .unwrap_or_default();
+    ensure!(
+        told.contains("needs more than 24M of memory: the kernel has ended it"),
+        "{found:#}"
+    );
+    let verdict = found["verdict"].as_str().unwrap_or_default();
+    ensure!(verdict.starts_with("only outsourced: "), "{verdict}");
+    ensure!(found["sla"]["has_local"] == false, "{found:#}");
+    none_is_left(daemon, PEOPLE.name)?;
+    let status = daemon.api("/api/v1/status")?;
+    let failing = status["back_offs"].as_array();
+    ensure!(failing.is_none_or(Vec::is_empty), "{status:#}");
+    // For people.
+    let bag = recordings.of("people");
+    let shown = daemon
+        .deployer()
+        .types(
+            &[
+                &["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"],
+                &words[..],
+            ]
+            .concat(),
+        )?
+        .succeeded()?;
+    for words in [
+        "out of memory",
+        "as pushed",
+        "local = \"none\"",
+        "nothing was written; --yes",
+    ] {
+        ensure!(shown.stdout.contains(words), "{words}: {}", shown.said());
+    }
+    Ok(())
+}
+
+/// Over TCP, with a token of the role that calibrates; at the recording's own pace.
+fn deployers_evaluate_what_is_theirs(
+    daemon: &Daemon,
+    recordings: &Recordings,
+    plot: &str,
+) -> Verdict {
+    let named = ["theirs", "--role", "deployer", "--service", TELLER.name];
+    let token = access::token(daemon, &named)?;
+    let package = binaries::package("teller_py");
+    let pushed = [&["push", path_str(&package)], TELLER.arguments].concat();
+    access::with_token(daemon, &token, &pushed)?.succeeded()?;
+    let bag = recordings.of("words");
+    let words = ["eval", TELLER.name, "--requests", "10", "--plot", plot];
+    let words = [&words[..], &["--bag", path_str(&bag)]].concat();
+    let outcome = access::with_token(daemon, &token, &words)?.succeeded()?;
+    for words in [
+        "10 of 10",
+        "/chatter of the recording went to /teller/say",
+        "in stub.toml (desire is what 95 % of 10 outsourced requests took",
+    ] {
+        ensure!(
+            outcome.stdout.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    none_is_left(daemon, TELLER.name)
+}
+
+pub fn what_cannot_be_evaluated_is_said() -> Verdict {
+    let daemon = world().own("unevaluated").start()?;
+    for service in [ADDER, TELLER] {
+        let package = service.package.context("a package")?;
+        daemon
+            .deployer()
+            .pushes(package, service.arguments)?
+            .succeeded()?;
+    }
+    let recordings = Recordings::new()?;
+    let place = world().directory("unevaluated")?;
+    let plot = place.path().join("plot.svg");
+    let refused = |service: &str, bag: &Path, more: &[&str], saying: &[&str]| {
+        let words = [
+            "eval",
+            service,
+            "--bag",
+            path_str(bag),
+            "--plot",
+            path_str(&plot),
+        ];
+        let outcome = daemon.deployer().types(&[&words, more].concat())?;
+        outcome.failed_saying(saying)
+    };
+    let words = recordings.of("words");
+    let nowhere = place.path().join("nowhere.bag");
+    refused(TELLER.name, &nowhere, &[], &["cannot read", "nowhere.bag"])?;
+    let text = place.path().join("text.bag");
+    std::fs::write(&text, "no recording")?;
+    refused(
+        TELLER.name,
+        &text,
+        &[],
+        &["text.bag cannot be replayed", "no rosbag file"],
+    )?;
+    let people = recordings.of("people");
+    let saying = [
+        "(it has /camera)",
+        "its inputs are: ",
+        "/teller/say (std_msgs/String)",
+    ];
+    refused(TELLER.name, &people, &[], &saying)?;
+    let saying = [
+        "unheard_of",
+        "there are: ",
+        TELLER.name,
+        "cloudroidctl push",
+    ];
+    refused("unheard_of", &words, &[], &saying)?;
+    let directory = binaries::package("teller_py");
+    let saying = ["is a directory", "cloudroidctl push"];
+    refused(path_str(&directory), &words, &[], &saying)?;
+    let saying = [
+        "/add_two",
+        "a recording holds messages of topics alone",
+        "explain",
+    ];
+    refused(ADDER.name, &words, &[], &saying)?;
+    refused(
+        TELLER.name,
+        &words,
+        &["--robot-cpus", "0"],
+        &["cpus = 0 is not between"],
+    )?;
+    refused(TELLER.name, &words, &["--robot-memory", "64T"], &["64T"])?;
+    refused(TELLER.name, &words, &["--cpus", "4000"], &["4000 cores"])?;
+    // Its node ends at the first request.
+    let saying = [TELLER.name, "exited with status 0"];
+    refused(TELLER.name, &recordings.of("end"), &[], &saying)?;
+    none_is_left(&daemon, TELLER.name)?;
+    interrupted(&daemon, &words, &plot)
+}
+
+/// Nobody waits for the rest.
+fn interrupted(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
+    let going = Command::new(binaries::path("cloudroidctl"))
+        .env("CLOUDROID_HOME", &daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .args(["eval", TELLER.name, "--requests", "10000", "--bag"])
+        .arg(bag)
+        .arg("--plot")
+        .arg(plot)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    let seen = support::until("a servant that is measured", || {
+        let found = crate::calibration::measured(daemon, TELLER.name)?;
+        Ok(found
+            .iter()
+            .any(|servant| servant["phase"] == "ready")
+            .then_some(())
+            .ok_or_else(|| "none".to_owned()))
+    });
+    kill(Pid::from_raw(i32::try_from(going.id())?), Signal::SIGINT)?;
+    let outcome = going.wait_with_output()?;
+    seen?;
+    let said = String::from_utf8_lossy(&outcome.stderr);
+    ensure!(
+        outcome.status.code() == Some(1) && said.contains("cancelled; nothing was written"),
+        "{said}"
+    );
+    ensure!(!plot.exists(), "it drew what was not measured");
+    none_is_left(daemon, TELLER.name)
+}
