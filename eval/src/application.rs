@@ -61,8 +61,7 @@ pub fn run(site: &Site, plan: &Plan, seconds: f64, node: &Running) -> Result<Tra
         ends.is_some_and(|ends| !ends.publishers.is_empty() && ends.subscribers.len() > 1)
     })?;
     let duration = seconds.to_string();
-    // A stub takes what is played before the node in the cloud has started, and passes it on then: all at once, of which a node with a
-    // queue of one takes the last. Time to connect is what rosbag itself has for this.
+    // Time for subscribers to connect is what rosbag itself has.
     let mut words = vec!["-q", "--wait-for-subscribers", "--duration", &duration];
     words.extend(["--delay", CONNECT]);
     words.extend(["--bags=/mnt/recording.bag", "--topics", &plan.request]);

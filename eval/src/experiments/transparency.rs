@@ -275,6 +275,13 @@ pub fn section(runs: &Runs) -> Section {
             row[2] = format!("{} ({published})", row[2]);
         });
         section.findings.push(finding(*pair, own, through));
+        let late = late(&compared.natives[0], &compared.outsourced);
+        section.findings.extend((late > 0).then(|| {
+            format!(
+                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. What it answers builds on where it begins. A stub opens a topic to the cloud with its first message, and the node there connects only then.",
+                pair.package
+            )
+        }));
         for (file, before, after) in &compared.application {
             files.push([
                 pair.package.to_owned(),
@@ -304,6 +311,18 @@ pub fn section(runs: &Runs) -> Section {
     }
     section.tables.extend([answers, files]);
     section
+}
+
+/// How many requests at the beginning were answered on the robot alone.
+fn late(native: &Trace, outsourced: &Trace) -> usize {
+    let answered = outsourced.requests.iter().find(|one| one.digest.is_some());
+    let Some(first) = answered.map(|one| one.stamp) else {
+        return 0;
+    };
+    let before = native.requests.iter();
+    before
+        .filter(|one| one.digest.is_some() && one.stamp + 1e-6 < first)
+        .count()
 }
 
 fn finding(pair: Pair, own: Difference, through: Difference) -> String {
@@ -375,6 +394,17 @@ mod tests {
         let mut other = one.clone();
         other.requests.remove(1);
         assert_eq!(Difference::of(&one, &other), difference(2, 2, 0.0));
+    }
+
+    #[test]
+    fn requests_that_only_the_robot_answered_at_first_are_counted() {
+        let native = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
+        let mut outsourced = native.clone();
+        assert_eq!(late(&native, &outsourced), 0);
+        outsourced.requests.remove(0);
+        assert_eq!(late(&native, &outsourced), 1);
+        outsourced.requests[0].digest = None;
+        assert_eq!(late(&native, &outsourced), 2);
     }
 
     #[test]
