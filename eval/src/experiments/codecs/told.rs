@@ -97,6 +97,16 @@ pub(super) fn saving(runs: &Runs, what: &What, sent: &Sent) -> Option<f64> {
     Some(100.0 * (1.0 - sent.carried?[0] / base.carried?[0]))
 }
 
+/// Percent of the bytes to the servant that this codec saves of the median message that was encoded: what the link sends as it is does not
+/// make it less.
+fn where_encoded(runs: &Runs, what: &What, sent: &Sent) -> Option<f64> {
+    let (_, base) = base(runs, what).filter(|_| what.setting != Setting::None)?;
+    let whole = base.carried?[0];
+    let each = sent.each.iter().map(|bytes| *bytes as f64);
+    let smaller: Vec<f64> = each.filter(|bytes| *bytes < SMALLER * whole).collect();
+    Some(100.0 * (1.0 - quantile(&smaller, 0.5)? / whole))
+}
+
 /// Messages that were sent in clearly fewer bytes than without a codec.
 pub(super) fn encoded(runs: &Runs, what: &What, sent: &Sent) -> Option<usize> {
     let (_, base) = base(runs, what).filter(|_| what.setting != Setting::None)?;
@@ -137,6 +147,7 @@ fn saved(runs: &Runs) -> Table {
             "published row",
             "published: saved",
             "saved here",
+            "of a message that was encoded",
             "bytes to the servant",
             "bytes back",
             "messages encoded",
@@ -158,6 +169,7 @@ fn saved(runs: &Runs) -> Table {
             } else {
                 percent(saving(runs, what, sent))
             },
+            percent(where_encoded(runs, what, sent)),
             bytes(sent.carried.map(|ways| ways[0])),
             bytes(sent.carried.map(|ways| ways[1])),
             encoded(runs, what, sent).map_or_else(
@@ -361,9 +373,9 @@ mod tests {
         let rows = &section.tables[0].rows;
         assert_eq!(rows[0][4], "the base");
         assert_eq!(rows[1][3..5], ["75.4 %", "50.0 %"].map(str::to_owned));
-        assert_eq!(rows[2][4], "95.0 %");
+        assert_eq!(rows[2][4..6], ["95.0 %", "95.0 %"].map(str::to_owned));
         assert_eq!(
-            rows[2][7..],
+            rows[2][8..],
             ["1 of 2", "37.0 (36.0)", "2 of 3"].map(str::to_owned)
         );
         assert_eq!(section.tables[2].rows[0][4], "25.00 %");
