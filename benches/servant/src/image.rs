@@ -1,6 +1,8 @@
 //! The service's image as its servants run it: what the daemon told their shims.
 
-use anyhow::{Context, Result};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
 use package::interface::{Direction, Interface};
 use ros::bus::Graph;
 use servant::container::ContainerSpec;
@@ -10,6 +12,9 @@ use servant::spec::NodeSpec;
 use bench_servant::Daemon;
 
 use crate::robot::Robot;
+
+/// How long the record of a servant's nodes may take.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A service of one node.
 pub(crate) struct Image {
@@ -26,10 +31,7 @@ impl Image {
     pub(crate) fn of(daemon: &Daemon, service: &str) -> Result<Self> {
         let mut robot = Robot::connect(&daemon.address, service)?;
         robot.nodes()?;
-        let id = daemon.servants()?.into_iter().next().context("a servant")?;
-        let directory = daemon.home().join("servants").join(id);
-        let launch: Launch =
-            launch::read(&directory.join(launch::SPEC))?.context("a launch record")?;
+        let launch = started(daemon)?;
         robot.leave()?;
         daemon.until_servants(0)?;
         let interface = daemon.get(&format!("/api/v1/services/{service}/interface"))?;
@@ -71,5 +73,25 @@ impl Image {
                 .services
                 .iter()
                 .all(|service| graph.services.contains_key(&service.name))
+    }
+}
+
+/// The record of the servant whose nodes were started. A container that was made ahead has one, too, without nodes; on a busy machine it is
+/// the one that is seen first.
+fn started(daemon: &Daemon) -> Result<Launch> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        for id in daemon.servants()? {
+            let path = daemon.home().join("servants").join(id).join(launch::SPEC);
+            let record: Option<Launch> = launch::read(&path)?;
+            if let Some(launch) = record.filter(|launch| !launch.spec.nodes.is_empty()) {
+                return Ok(launch);
+            }
+        }
+        ensure!(
+            Instant::now() < deadline,
+            "no servant has a record of its nodes"
+        );
+        std::thread::sleep(Duration::from_millis(20));
     }
 }
