@@ -14,7 +14,7 @@ use crate::cells::{Cells, Measured};
 use crate::experiments::crowd::{self, Controller, LONG, Yard};
 use crate::plots::{self, Bar};
 use crate::section::{Missing, Section, Table};
-use crate::statistics::quantile;
+use crate::statistics::{mean, quantile};
 use crate::words::{digits, milliseconds};
 
 /// The part of its requests that must be in time for a robot to count.
@@ -225,12 +225,16 @@ impl Runs {
 
     fn find(&self, section: &mut Section) {
         let (mut counts, mut of) = ([0; 2], 0);
+        let mut eager: [Vec<f64>; 2] = Default::default();
         for robots in self.numbers() {
             let [Some(off), Some(on)] = BOTH.map(|controller| self.of(controller, robots)) else {
                 continue;
             };
             counts = [counts[0] + counted(off), counts[1] + counted(on)];
             of += robots;
+            for (shares, all) in eager.iter_mut().zip([off, on]) {
+                shares.extend(all.iter().filter(|had| had.eager).filter_map(Had::share));
+            }
         }
         if of == 0 {
             return;
@@ -248,13 +252,19 @@ impl Runs {
                 std::cmp::Ordering::Equal if on == of =>
                     ": there was nothing to be gained, because each robot's promise was enough.".to_owned(),
                 std::cmp::Ordering::Equal =>
-                    ": the controller gained nothing here, which is worse than hoped; it looks once a second, and a run of a few \
-                     seconds may end before it has moved enough."
-                        .to_owned(),
+                    ": the controller won no robot here, which is worse than hoped.".to_owned(),
                 std::cmp::Ordering::Less =>
                     ", which is worse than hoped: robots lost what they had while cores were moved to others.".to_owned(),
             }
         ));
+        if let [Some(off), Some(on)] = eager.map(|shares| mean(&shares)) {
+            section.findings.push(format!(
+                "Of the requests of those that ask at once and accept less than they were promised, {:.0} % were in time with fixed \
+                 limits and {:.0} % with the controller (mean of the robots' shares).",
+                off * 100.0,
+                on * 100.0
+            ));
+        }
     }
 }
 
@@ -316,6 +326,12 @@ mod tests {
             "{found}"
         );
         assert_eq!(section.tables[0].rows[1][3..5], ["0", "100"]);
+        assert!(
+            section.findings[1].contains("50 % were in time")
+                && section.findings[1].contains("100 % with"),
+            "{:?}",
+            section.findings
+        );
         let mut section = Section::new(9, "a", "b");
         tell(
             &runs(vec![good.clone(), good], vec![bad.clone(), bad]),
