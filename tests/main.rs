@@ -172,6 +172,7 @@ fn main() -> ExitCode {
         ],
         stories![commands:
             a_script_can_tell_by_the_exit_status_what_to_do,
+            a_servant_is_named_by_its_service_where_that_has_no_other,
             who_follows_events_misses_none_when_the_daemon_is_started_again,
             shells_complete_it_and_every_verb_has_a_page,
             top_shows_who_uses_the_machine,

@@ -134,6 +134,43 @@ impl Drop for Follower {
     }
 }
 
+pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
+    let daemon = world().own("by-name").start()?;
+    let deployer = daemon.deployer();
+    deployer
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .succeeded()?;
+    let types = |words: &[&str]| deployer.types(words);
+    let never = types(&["fit", "adder_py", "--cpus", "4000"])?.succeeded()?;
+    ensure!(
+        never
+            .stdout
+            .contains("it would be refused, now and later: a servant of 4000 cores"),
+        "{}",
+        never.said()
+    );
+    types(&["stop", "adder_py"])?.failed_saying(&["adder_py"])?;
+    let one = daemon.robot("adder_py?robot=one")?;
+    daemon.awaits_event("a ready servant", |event| {
+        event["kind"] == "servant-ready" && event["robot"] == "one"
+    })?;
+    types(&["set", "adder_py", "--cpus", "0.5"])?.succeeded()?;
+    let servant = daemon.servant_of("adder_py", "one")?;
+    ensure!(servant["limits"]["cpus"] == 0.5, "{servant:#}");
+    let two = daemon.robot("adder_py?robot=two")?;
+    let saying = ["adder_py has 2 servants; name one: "];
+    types(&["set", "adder_py", "--cpus", "1"])?.failed_saying(&saying)?;
+    types(&["stop", "adder_py"])?.failed_saying(&saying)?;
+    drop(two);
+    let id = daemon.servant_of("adder_py", "two")?["id"].clone();
+    types(&["stop", id.as_str().context("an id")?])?.succeeded()?;
+    let stopped = types(&["stop", "adder_py"])?.succeeded()?;
+    let id = servant["id"].as_str().context("an id")?;
+    ensure!(stopped.stdout.contains(id), "{}", stopped.said());
+    drop(one);
+    Ok(())
+}
+
 pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verdict {
     let setup = world().own("followed");
     let daemon = setup.start()?;

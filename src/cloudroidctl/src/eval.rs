@@ -5,6 +5,8 @@ mod network;
 mod plot;
 mod probe;
 mod robot;
+mod shown;
+mod side;
 mod verdict;
 
 use std::fs;
@@ -25,7 +27,8 @@ use crate::output::{self, Format};
 use network::Network;
 use probe::{Asked, Probe};
 use robot::{Class, Robot};
-use verdict::{Evaluation, Side};
+use side::Side;
+use verdict::Evaluation;
 
 /// Seconds for which the outsourced servant stays for what is asked over the network: each request may take as long as the
 /// daemon waits for one.
@@ -100,7 +103,7 @@ impl Eval {
             .with_context(|| format!("cannot write the plot {}", plot.display()));
         match format {
             Format::Json => output::json(&measured)?,
-            Format::Table => verdict::print(&measured, &plot)?,
+            Format::Table => shown::print(&measured, &plot)?,
         }
         if let Err(error) = drawn {
             output::complain(&format!("warning: {error:#}"));

@@ -10,6 +10,7 @@ use http_body_util::BodyStream;
 use hyper::Method;
 
 use crate::client::{Client, empty, escaped};
+use crate::inside;
 use crate::output::{self, Format, Table};
 use crate::whole::Half;
 
@@ -54,7 +55,7 @@ struct Get {
 /// Write what flowed in a servant in the last seconds, now.
 #[derive(Debug, clap::Args)]
 struct Take {
-    /// The servant's id.
+    /// The servant's id, or the name of a service that has one servant.
     servant: String,
 }
 
@@ -72,7 +73,8 @@ impl Recordings {
             Verb::List(verb) => verb.run(client, format).await,
             Verb::Get(verb) => verb.run(client, format).await,
             Verb::Take(verb) => {
-                let path = format!("/api/v1/servants/{}/recording", escaped(&verb.servant));
+                let servant = inside::servant(client, &verb.servant).await?;
+                let path = format!("/api/v1/servants/{}/recording", escaped(&servant));
                 let taken: Recording = client.post(&path, &()).await?;
                 list(&[taken], format)
             }

@@ -4,13 +4,14 @@ use anyhow::bail;
 use api::{Limits, Servant};
 
 use crate::client::{Client, escaped};
+use crate::inside;
 use crate::limits::LimitFlags;
 use crate::output::{self, Format};
 
 /// Change limits of a servant while it works. Those that are not named stay; what it is promised changes too.
 #[derive(Debug, clap::Args)]
 pub struct Set {
-    /// Id of the servant.
+    /// The servant's id, or the name of a service that has one servant.
     servant: String,
     #[command(flatten)]
     limits: LimitFlags,
@@ -23,7 +24,8 @@ impl Set {
         if limits == Limits::default() {
             bail!("nothing to change; name a limit, such as --cpus 1.5 or --memory 512M");
         }
-        let path = format!("/api/v1/servants/{}", escaped(&self.servant));
+        let servant = inside::servant(client, &self.servant).await?;
+        let path = format!("/api/v1/servants/{}", escaped(&servant));
         let servant: Servant = client.patch(&path, &limits).await?;
         match format {
             Format::Json => output::json(&servant),

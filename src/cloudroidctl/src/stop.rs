@@ -3,13 +3,14 @@
 use api::Stopped;
 
 use crate::client::{Client, escaped};
+use crate::inside;
 use crate::output::{self, Format};
 
 /// End servants. A robot that connects again is given a new one.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("which").required(true).args(["servants", "service", "all"])))]
 pub struct Stop {
-    /// Ids of servants.
+    /// Ids of servants, or names of services that have one servant.
     servants: Vec<String>,
     /// All servants of this service.
     #[arg(long, value_name = "NAME")]
@@ -28,10 +29,13 @@ impl Stop {
         } else if let Some(service) = &self.service {
             vec![format!("/api/v1/servants?service={}", escaped(service))]
         } else {
-            self.servants
-                .iter()
-                .map(|id| format!("/api/v1/servants/{}", escaped(id)))
-                .collect()
+            // All are known before the first is ended.
+            let mut paths = Vec::new();
+            for named in &self.servants {
+                let id = inside::servant(client, named).await?;
+                paths.push(format!("/api/v1/servants/{}", escaped(&id)));
+            }
+            paths
         };
         for path in paths {
             ended

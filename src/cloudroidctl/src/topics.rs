@@ -11,9 +11,14 @@ pub struct Topics {
 impl Topics {
     /// Whether this one is among them.
     pub fn want(&self, topic: &str) -> bool {
-        let matches = |pattern: &String| match pattern.strip_suffix('*') {
-            Some(begins) => topic.starts_with(begins),
-            None => topic == pattern,
+        // As a servant names them; `tf` is `/tf`, as everywhere in ROS.
+        let topic = topic.strip_prefix('/').unwrap_or(topic);
+        let matches = |pattern: &String| {
+            let pattern = pattern.strip_prefix('/').unwrap_or(pattern);
+            match pattern.strip_suffix('*') {
+                Some(begins) => topic.starts_with(begins),
+                None => topic == pattern,
+            }
         };
         self.topics.is_empty() || self.topics.iter().any(matches)
     }
@@ -32,5 +37,8 @@ mod tests {
         let some = topics(&["/tf", "/camera/*"]);
         assert!(some.want("/tf") && some.want("/camera/left/image"));
         assert!(!some.want("/tf_static") && !some.want("/camera"));
+        let relative = topics(&["tf", "camera/*"]);
+        assert!(relative.want("/tf") && relative.want("/camera/left/image"));
+        assert!(!relative.want("/tf_static") && topics(&["*"]).want("/any"));
     }
 }

@@ -4,7 +4,8 @@
 use crate::calibrate::curve::{
     Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, number, put, text,
 };
-use crate::eval::verdict::{Evaluation, Side};
+use crate::eval::side::Side;
+use crate::eval::verdict::Evaluation;
 
 const ORANGE: &str = "#d95f02";
 

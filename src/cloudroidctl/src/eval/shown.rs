@@ -1,0 +1,110 @@
+//! An evaluation for people.
+
+use std::path::Path;
+
+use api::Size;
+use api::calibration::TimeSpread;
+
+use super::side::Side;
+use super::verdict::Evaluation;
+use crate::calibrate::rows;
+use crate::output::{self, Table};
+use crate::trial::renamed;
+
+/// Shows it.
+pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
+    output::line("")?;
+    response_times(of)?;
+    output::line("")?;
+    phases(of)?;
+    if let Some(network) = of.network {
+        output::line(&format!(
+            "UP and DOWN are a network of {network}, which was not there: it is added"
+        ))?;
+    }
+    for words in renamed(&of.inputs) {
+        output::line(&words)?;
+    }
+    if !of.unused.is_empty() {
+        output::line(&format!("not used: {}", of.unused.join(", ")))?;
+    }
+    output::line(&format!(
+        "native has been measured on cores of this server; a robot's own cores are slower, if they are other ones\nplot: {}\n",
+        plot.display()
+    ))?;
+    output::line(&of.verdict)?;
+    let Some(sla) = &of.sla else {
+        return output::line(
+            "no SLA is suggested: outsourced, too few requests were answered, or not at the recording's pace",
+        );
+    };
+    output::line(&format!("\nin stub.toml ({}):", sla.reason))?;
+    for line in sla.stub_toml() {
+        output::line(&format!("    {line}"))?;
+    }
+    output::line("")?;
+    rows(std::slice::from_ref(&sla.row))
+}
+
+fn sides(of: &Evaluation) -> [(&'static str, &Side); 2] {
+    [("native", &of.native), ("outsourced", &of.outsourced)]
+}
+
+fn response_times(of: &Evaluation) -> anyhow::Result<()> {
+    let mut table = Table::new(&[
+        "", "CPUS", "MEMORY", "USED", "ANSWERED", "P50 MS", "P95 MS", "MAX MS",
+    ]);
+    for (name, side) in sides(of) {
+        let time = |of: fn(&TimeSpread) -> f64| {
+            let shown = side.rrt.as_ref().map(|rrt| format!("{:.1}", of(rrt)));
+            shown.unwrap_or_else(|| "-".to_owned())
+        };
+        let answered = match side.out_of_memory {
+            Some(_) => "out of memory".to_owned(),
+            None => format!("{} of {}", side.answered, side.requests),
+        };
+        let limit = side.memory_limit.map(|limit| limit.to_string());
+        table.row([
+            name.to_owned(),
+            side.cpus.to_string(),
+            limit.unwrap_or_else(|| "as pushed".to_owned()),
+            match side.memory {
+                Size(0) => "-".to_owned(),
+                used => used.to_string(),
+            },
+            answered,
+            time(|rrt| rrt.p50),
+            time(|rrt| rrt.p95),
+            time(|rrt| rrt.max),
+        ]);
+    }
+    table.print()
+}
+
+fn phases(of: &Evaluation) -> anyhow::Result<()> {
+    let mut table = Table::new(&[
+        "",
+        "UP",
+        "TRANSPORT",
+        "DOWN",
+        "COMPUTE",
+        "RUNNING",
+        "HELD UP",
+    ]);
+    for (name, side) in sides(of) {
+        let cells = side.phases.map(|phases| {
+            [
+                phases.up,
+                phases.transport,
+                phases.down,
+                phases.compute,
+                phases.running,
+                phases.held_up,
+            ]
+            .map(|time| format!("{time:.1}"))
+        });
+        let cells = cells.unwrap_or_else(|| std::array::from_fn(|_| "-".to_owned()));
+        table.row(std::iter::once(name.to_owned()).chain(cells));
+    }
+    table.print()
+}
