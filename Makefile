@@ -167,7 +167,9 @@ bench: test-deps build ## every measurement with its peer in the same run; ONLY=
 	@BIN="$(CARGO_TARGET_DIR)/release" scripts/bench $(ONLY)
 
 # What the evaluation runs beside its own experiments.
-EVAL_BENCHES := failover servant portal link
+EVAL_BENCHES := servant portal link
+# Its programs stand by themselves: they have the codec of colour video, which is a feature.
+EVAL := $(CARGO_TARGET_DIR)/eval-programs
 
 .PHONY: eval
 ifneq ($(QUICK),)
@@ -175,10 +177,15 @@ eval: eval-quick
 else
 eval: test-deps build ## the published experiments on this machine, with a report; QUICK=1: few requests; ONLY=2,7; FRESH=1: all anew (as root)
 	@scripts/deps build run test eval
-	@cargo build --locked --release -p eval
-	@cargo build --locked --release $(EVAL_BENCHES:%=-p bench-%)
-	@cargo build --locked --release -p bench-codecs --features video
-	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/release/eval" $(EVAL_WORDS)
+	@cargo build --locked --release -p eval $(EVAL_BENCHES:%=-p bench-%)
+	@cargo build --locked --release -p cloudroidd --features video
+	@cargo build --locked --profile stub -p cloudroid-stub --features video
+	@install -D -m 755 "$(CARGO_TARGET_DIR)/stub/cloudroid-stub" "$(EVAL)/stubs/x86_64/cloudroid-stub"
+	@for program in eval cloudroidd cloudroidctl cloudroid-init $(EVAL_BENCHES:%=bench-%); do \
+	  install -m 755 "$(CARGO_TARGET_DIR)/release/$$program" "$(EVAL)/$$program"; \
+	done
+	@$(MAKE) build
+	@CLOUDROID_BIN="$(EVAL)" "$(EVAL)/eval" $(EVAL_WORDS)
 endif
 
 EVAL_WORDS = $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))

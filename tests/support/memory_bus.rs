@@ -99,6 +99,7 @@ impl Topic {
                 .map(|id| Peer {
                     id: id.clone(),
                     connected: true,
+                    offer: None,
                 })
                 .collect(),
         };

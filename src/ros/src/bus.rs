@@ -28,7 +28,7 @@ pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents
 pub use error::{BusError, CallFate};
 pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
-pub use matched::{Matched, Peer, PeerId, reaches};
+pub use matched::{Matched, Offer, Peer, PeerId, reaches};
 pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
 pub use qos::{Durability, Qos, Reliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};

@@ -10,7 +10,7 @@ use link::control::{FromRobot, Input, Wanted};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Matched, Message, PeerId, Qos, WireType};
+use ros::bus::{Digest, Matched, Message, Peer, PeerId, Qos, WireType};
 use ros::ros1::actions;
 use tokio::task::AbortHandle;
 
@@ -61,6 +61,9 @@ impl Inputs {
             let feed = match topics.get(&wanted.topic) {
                 Some(topic) => {
                     self.send_latched(mirror, &wanted.topic);
+                    if wanted.feed {
+                        self.expect(mirror, &wanted.topic);
+                    }
                     topic.feed.clone()
                 }
                 None => {
@@ -103,7 +106,12 @@ impl Inputs {
                 let publisher = message.publisher.clone();
                 channels.latched.insert(publisher, message.clone());
             }
-            channels.of(mirror, topic, message)
+            channels.of(
+                mirror,
+                topic,
+                (&message.publisher, message.latching),
+                &message.wire_type,
+            )
         };
         // Goals and what cancels them are no stream of which the newest would do.
         let of = &message.wire_type.name;
@@ -124,6 +132,32 @@ impl Inputs {
             message: message.bytes.clone(),
         };
         mirror.session().publish(data, quality);
+    }
+
+    /// Opens the topic for who will publish it: in the cloud the node is connected then when the first message comes.
+    fn expect(&self, mirror: &Mirror, topic: &str) {
+        if let Some(channels) = self.channels.lock().get_mut(topic) {
+            for (publisher, of) in channels.offered.clone() {
+                channels.of(mirror, topic, (&publisher, false), &of);
+            }
+        }
+    }
+
+    /// These are there now, and will publish this.
+    fn offered(&self, topic: &str, present: &Matched, inside: impl Fn(&str) -> bool) {
+        let stream = |peer: &Peer| {
+            // What is latched comes at once.
+            let offer = peer.offer.as_ref().filter(|offer| !offer.latching)?;
+            let known = offer.wire_type.name != "*" && !inside(peer.id.node());
+            known.then(|| (peer.id.clone(), offer.wire_type.clone()))
+        };
+        let mut channels = self.channels.lock();
+        let channels = match channels.get_mut(topic) {
+            Some(channels) => channels,
+            None => channels.entry(topic.to_owned()).or_default(),
+        };
+        let connected = present.peers.iter().filter(|peer| peer.connected);
+        channels.offered = connected.filter_map(stream).collect();
     }
 
     /// Only these publishers of a topic are left: what the cloud was given of others is taken back.
@@ -174,6 +208,8 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
     }
     let topic: Arc<str> = wanted.topic.as_str().into();
     let mut present = subscription.matched.clone();
+    // Who is there already is no change.
+    present.mark_changed();
     let mut latching: BTreeSet<PeerId> = BTreeSet::new();
     loop {
         let message = tokio::select! {
@@ -186,6 +222,12 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
                 };
                 let present = present.borrow_and_update().clone();
                 mirror.inputs.left(&mirror, &topic, &present);
+                // Other nodes of the servant hear each other inside.
+                let siblings = mirror.siblings.read().clone();
+                mirror.inputs.offered(&topic, &present, |node| siblings.contains(node));
+                if feed.load(Ordering::Relaxed) {
+                    mirror.inputs.expect(&mirror, &topic);
+                }
                 latching.retain(|publisher| {
                     let stays = present.contains(publisher);
                     if let Some(keeper) = mirror.keeper().filter(|_| !stays) {
@@ -221,6 +263,8 @@ struct Channels {
     latched: HashMap<PeerId, Message>,
     /// Of that, what a new servant was not given yet.
     to_send_again: HashMap<PeerId, Message>,
+    /// What those publish who are connected and do not latch.
+    offered: HashMap<PeerId, Arc<WireType>>,
 }
 
 struct Channel {
@@ -250,20 +294,25 @@ impl Channels {
         self.latched.retain(|name, _| present.contains(name));
     }
 
-    fn of(&mut self, mirror: &Mirror, topic: &str, message: &Message) -> u32 {
-        let publisher = message.latching.then(|| message.publisher.clone());
-        let key = (publisher, message.wire_type.digest.clone());
+    /// The number of the channel of this publisher, which latches or does not.
+    fn of(
+        &mut self,
+        mirror: &Mirror,
+        topic: &str,
+        (publisher, latching): (&PeerId, bool),
+        of: &WireType,
+    ) -> u32 {
+        let key = (latching.then(|| publisher.clone()), of.digest.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
             mirror.session().report(&FromRobot::Open(Input {
                 channel,
                 topic: topic.to_owned(),
-                type_name: message.wire_type.name.clone(),
-                md5: message.wire_type.digest.to_string(),
-                definition: message.wire_type.definition.clone(),
-                latching: message.latching,
+                type_name: of.name.clone(),
+                md5: of.digest.to_string(),
+                definition: of.definition.clone(),
+                latching,
             }));
-            let of = &message.wire_type;
             let schema = codec::Schema::of(&of.name, of.digest.as_str());
             mirror.session().opens(channel, topic, schema);
             Channel {
@@ -271,8 +320,8 @@ impl Channels {
                 publishers: BTreeSet::new(),
             }
         });
-        if !known.publishers.contains(&message.publisher) {
-            known.publishers.insert(message.publisher.clone());
+        if !known.publishers.contains(publisher) {
+            known.publishers.insert(publisher.clone());
         }
         known.number
     }

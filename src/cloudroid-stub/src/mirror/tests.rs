@@ -219,6 +219,33 @@ async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before() {
 }
 
 #[tokio::test]
+async fn the_node_is_connected_before_the_first_message_comes() {
+    let scene = Scene::new("/node").await;
+    let mut heard = hears(&scene.real, "/scan").await;
+    let robot = node(scene.robot, "/laser").await;
+    // One is there before the link is, the other comes later; neither has said anything.
+    let early = says(&robot, "/scan", false).await;
+    let _link = scene.links().await;
+    let connected = heard.matched.wait_for(|now| now.connected() == 1);
+    assert!(timeout(SOON, connected).await.is_ok(), "nobody publishes");
+    let _other = hears(&scene.real, "/camera").await;
+    let camera = says(&robot, "/camera", false).await;
+    until(&scene.real, "the camera", |graph| {
+        is_published(graph, "/camera")
+    })
+    .await;
+    early.publish(bytes("first"));
+    assert_eq!(next(&mut heard).await, "first");
+    assert_eq!(scene.mirror.inputs.known(), (2, 0));
+    // Who leaves without a word leaves the cloud, too.
+    drop(camera);
+    until(&scene.real, "no camera", |graph| {
+        !is_published(graph, "/camera")
+    })
+    .await;
+}
+
+#[tokio::test]
 async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
     let scene = Scene::new("/node").await;
     let output = Output {

@@ -6,6 +6,10 @@ use tokio::time::Instant;
 const FIRST_RATES: usize = 3;
 /// The weight of a new measurement.
 const NEWEST: f64 = 0.25;
+/// Reports that come nearer to each other are one measurement, seconds: after a packet that was lost they come together.
+const SHORTEST: f64 = 0.001;
+/// A measurement counts as so many times the estimate at the most: what had piled up somewhere was not carried that fast.
+const AT_ONCE: f64 = 2.0;
 
 /// Bytes per second that the link carried when it had to.
 #[derive(Debug, Default)]
@@ -40,12 +44,16 @@ impl Throughput {
 
     /// Takes in what was counters; the new estimate, if it changes.
     pub(super) fn report(&mut self, counters: Counters) -> Option<f64> {
-        let before = self.before.replace(counters)?;
+        let before = *self.before.get_or_insert(counters);
         let seconds = counters.at.duration_since(before.at).as_secs_f64();
-        let rate = counters.bytes.saturating_sub(before.bytes) as f64 / seconds.max(1e-6);
+        if seconds < SHORTEST {
+            return None;
+        }
+        self.before = Some(counters);
+        let rate = counters.bytes.saturating_sub(before.bytes) as f64 / seconds;
         // With nothing to send a link is not slow: all of it had been sent by then, or there was more all the time.
         let busy = before.sent >= counters.bytes || (!counters.idle && !before.idle);
-        let counts = busy && seconds > 0.001 && counters.bytes > before.bytes;
+        let counts = busy && counters.bytes > before.bytes;
         let quicker = self.known.is_some_and(|known| rate > known);
         (counts || quicker).then(|| self.measure(rate)).flatten()
     }
@@ -54,7 +62,10 @@ impl Throughput {
     /// first ones count by the greatest among them.
     fn measure(&mut self, rate: f64) -> Option<f64> {
         match self.known {
-            Some(known) => self.known = Some(known + NEWEST * (rate - known)),
+            Some(known) => {
+                let rate = rate.min(AT_ONCE * known);
+                self.known = Some(known + NEWEST * (rate - known));
+            }
             None => {
                 self.first.push(rate);
                 if self.first.len() < FIRST_RATES {
@@ -105,5 +116,38 @@ mod tests {
         };
         assert_eq!(throughput.report(first), None);
         assert_eq!(throughput.known(), Some(106.25));
+    }
+
+    #[test]
+    fn what_piled_up_behind_a_lost_packet_does_not_make_a_link_fast() {
+        let mut throughput = Throughput::default();
+        let start = Instant::now();
+        let mut bytes = 0;
+        let mut report = |throughput: &mut Throughput, micros: u64| {
+            bytes += 64_000;
+            throughput.report(Counters {
+                at: start + Duration::from_micros(micros),
+                bytes,
+                sent: u64::MAX,
+                idle: false,
+            })
+        };
+        // 64 kB every 13 ms, which is 4.9 MB/s.
+        for number in 0..10 {
+            report(&mut throughput, number * 13_000);
+        }
+        // A packet is lost: seven are told of at once, then it goes on.
+        for number in 0..7 {
+            report(&mut throughput, 217_000 + number * 2);
+        }
+        report(&mut throughput, 230_000);
+        let known = throughput.known().expect("it was measured");
+        assert!((4e6..8e6).contains(&known), "{known}");
+        // One that has become fast is known to be so soon.
+        for number in 0..20 {
+            report(&mut throughput, 231_100 + number * 1_100);
+        }
+        let known = throughput.known().expect("it was measured");
+        assert!((40e6..60e6).contains(&known), "{known}");
     }
 }

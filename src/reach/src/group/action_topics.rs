@@ -135,6 +135,7 @@ impl ActionTopics {
         let peer = Peer {
             id: node.clone(),
             connected: true,
+            offer: None,
         };
         Ok(Arc::new(ActionTopics {
             name: name.to_owned(),

@@ -5,6 +5,8 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
+use super::WireType;
+
 /// Tells publishers, or subscribers, of a topic apart. It is shown as the name of its node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PeerId {
@@ -38,6 +40,15 @@ impl fmt::Display for PeerId {
     }
 }
 
+/// What a publisher has said of all that it will send, before it sends anything.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Offer {
+    /// The type of its messages.
+    pub wire_type: Arc<WireType>,
+    /// Whether it keeps its last message for those who come later.
+    pub latching: bool,
+}
+
 /// A publisher as seen by a subscription, or the other way round.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Peer {
@@ -45,6 +56,8 @@ pub struct Peer {
     pub id: PeerId,
     /// Whether messages can pass now; else it was connected, and has not left as far as is known.
     pub connected: bool,
+    /// What it publishes, as far as is known; none of a subscriber.
+    pub offer: Option<Offer>,
 }
 
 /// Who is at the other end, at one moment.

@@ -15,7 +15,7 @@ use tokio::time::{sleep, timeout};
 use super::master_client::to_bus_error;
 use super::subscriptions::TopicIn;
 use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Message, PeerId, WireType};
+use crate::bus::{BusError, Message, Offer, PeerId, WireType};
 use crate::net;
 use crate::ros1::reply::Reply;
 use crate::ros1::tcpros::{self, FrameReader, Header};
@@ -33,7 +33,8 @@ pub(super) struct Link {
     uri: String,
     listed: watch::Sender<bool>,
     task: Mutex<Option<AbortHandle>>,
-    peer: Mutex<Option<Arc<WireType>>>,
+    /// What the publisher's header said, once it was connected.
+    offer: Mutex<Option<Offer>>,
     /// Its name, from the first connection on until it has left.
     pub(super) publisher: Mutex<Option<PeerId>>,
     pub(super) connected: AtomicBool,
@@ -63,7 +64,12 @@ impl Link {
 
     /// What the publisher said it publishes, once it was connected.
     pub(super) fn wire_type(&self) -> Option<Arc<WireType>> {
-        self.peer.lock().clone()
+        Some(self.offer.lock().as_ref()?.wire_type.clone())
+    }
+
+    /// The same, and whether it latches.
+    pub(super) fn offer(&self) -> Option<Offer> {
+        self.offer.lock().clone()
     }
 }
 
@@ -74,7 +80,7 @@ pub(super) fn start(bus: &Arc<Inner>, topic: &Arc<TopicIn>, uri: &str) -> Arc<Li
         uri: uri.to_owned(),
         listed: watch::Sender::new(true),
         task: Mutex::new(None),
-        peer: Mutex::new(None),
+        offer: Mutex::new(None),
         publisher: Mutex::new(None),
         connected: AtomicBool::new(false),
         messages: AtomicU64::new(0),
@@ -146,7 +152,10 @@ async fn connect_and_read(
         wire_type,
     } = connection;
     let wire_type = Arc::new(wire_type);
-    *link.peer.lock() = Some(wire_type.clone());
+    *link.offer.lock() = Some(Offer {
+        wire_type: wire_type.clone(),
+        latching,
+    });
     topic.came(link, &publisher);
     loop {
         let next = frames.next(&mut stream).await;

@@ -270,6 +270,7 @@ impl State {
         let peers = subscribers.chain(&self.actions).map(|id| Peer {
             id: id.clone(),
             connected: true,
+            offer: None,
         });
         Matched {
             peers: peers.collect(),

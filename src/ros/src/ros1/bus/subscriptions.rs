@@ -264,6 +264,7 @@ impl TopicIn {
             Some(Peer {
                 id: link.publisher.lock().clone()?,
                 connected: link.connected.load(Ordering::Relaxed),
+                offer: link.offer(),
             })
         });
         let now = Matched {
