@@ -278,7 +278,7 @@ pub fn section(runs: &Runs) -> Section {
         let late = late(&compared.natives[0], &compared.outsourced);
         section.findings.extend((late > 0).then(|| {
             format!(
-                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. What it answers builds on where it begins. A stub opens a topic to the cloud with its first message, and the node there connects only then.",
+                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. What it answers builds on where it begins, so that all later answers differ, too.",
                 pair.package
             )
         }));

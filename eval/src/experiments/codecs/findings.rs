@@ -48,7 +48,7 @@ fn as_they_are(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
     let plain = sent.each.len() - encoded(runs, what, sent)?;
     (plain > 0).then(|| {
         format!(
-            "{}, codec {}, {}: {plain} of {} messages went as they are, so that less is saved than the codec can save: the link encodes only while it measures less than 60 MB/s, and takes receipts that come in one go (after a lost packet, say) for a faster network.",
+            "{}, codec {}, {}: {plain} of {} messages went as they are, so that less is saved than the codec can save: the link encodes only once it has measured itself, and while that is less than 60 MB/s.",
             what.kind.name(),
             what.setting.name(),
             what.network.name(),
