@@ -48,10 +48,10 @@ pub struct CalibrationOptions {
     /// Auxiliary parameters of the rows, such as `image=640x480`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub aux: BTreeMap<String, String>,
-    /// Memory that the servant may use from its start on, as another machine would have it; without, the service's own limit.
+    /// Memory that the servant may use from its start on, as another machine would have it, whatever robots may ask for at most; without, the service's own limit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Size>,
-    /// It is measured once, at the limits that servants of robots which state nothing have.
+    /// It is measured once, at the cores that the service was pushed with, else at one core, at most those of the machine.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub own: bool,
     /// The time of each request is told as well.

@@ -164,7 +164,7 @@ impl Choreographer {
             }
             // Nobody who waits for capacity is overtaken by one that takes what was promised ahead.
             // Nor do nodes run already that may use less memory than they perhaps do.
-            let bounded = request.anonymous && request.stated.memory.is_some();
+            let bounded = request.set.memory.is_some();
             let default_names = request.stub.is_none() && !bounded && inner.admission.is_calm();
             let (placement, warm) = if is_place(&revision, &request.robot) {
                 // It needs no container.
@@ -210,7 +210,10 @@ impl Choreographer {
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
                 request.robot,
                 request.anonymous,
-                inner.asked(terms),
+                Asked {
+                    set: request.set,
+                    ..inner.asked(terms)
+                },
                 revision,
                 store::now(),
             ));
@@ -408,7 +411,7 @@ impl Choreographer {
         service: &str,
         material: Material,
     ) -> Result<api::trial::Trial, Error> {
-        let measured = self.measured(service, "try", api::Stated::default())?;
+        let measured = self.measured(service, "try", api::Limits::default())?;
         measured.lease.admitted().await?;
         let reach = measured.lease.ready().await?;
         let interface = &measured.lease.handle().revision.interface;
@@ -422,10 +425,10 @@ impl Choreographer {
     }
 
     /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name. Of a service that robots share
-    /// it is one of its own, beside the group.
-    fn measured(&self, service: &str, why: &str, stated: api::Stated) -> Result<Measured, Error> {
+    /// it is one of its own, beside the group. It has the limits of `set` from its start on.
+    fn measured(&self, service: &str, why: &str, set: api::Limits) -> Result<Measured, Error> {
         let robot = format!("~{why}-{}", names::random(6));
-        let request = ServantRequest::new(service, &robot).stating(stated);
+        let request = ServantRequest::new(service, &robot).setting(set);
         let lease = self.ensure(request.anonymous())?;
         Ok(Measured { lease })
     }

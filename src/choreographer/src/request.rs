@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use api::Stated;
+use api::{Limits, Stated};
 
 /// Whom a servant is asked for, of which service, and on which terms.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -16,6 +16,8 @@ pub struct ServantRequest {
     pub stub: Option<String>,
     /// What is stated. Where it is nothing, what was stated before stays.
     pub stated: Stated,
+    /// Limits that this daemon sets from the start on, whatever robots may ask for: of what it measures.
+    pub(crate) set: Limits,
 }
 
 impl ServantRequest {
@@ -47,6 +49,11 @@ impl ServantRequest {
     /// The same with what is stated.
     pub fn stating(self, stated: Stated) -> ServantRequest {
         ServantRequest { stated, ..self }
+    }
+
+    /// The same with limits that this daemon sets.
+    pub(crate) fn setting(self, set: Limits) -> ServantRequest {
+        ServantRequest { set, ..self }
     }
 
     /// Who states it, of all clients of one robot: the stub's node, or nobody's name.

@@ -55,7 +55,7 @@ pub struct Eval {
     /// The robot's memory, instead of that of its class.
     #[arg(long, value_name = "BYTES")]
     robot_memory: Option<Size>,
-    /// Cores of the outsourced servant; by default the service's own limit.
+    /// Cores of the outsourced servant; by default those that it was pushed with, else one core, which the row promises then.
     #[arg(long, value_name = "N")]
     cpus: Option<f64>,
     /// What a network adds to what is measured, where this is typed at the server itself: lan (1 ms each way, 100 Mbit/s), wan (30 ms,
@@ -139,7 +139,8 @@ impl Eval {
     async fn check(&self, client: &Client) -> anyhow::Result<ServiceDetail> {
         let name = &self.service;
         let path = Path::new(name);
-        if name.contains('/') || path.is_dir() || path.join("package.xml").exists() {
+        // A service may have the name of a directory that lies here.
+        if name.contains('/') || matches!(&**name, "." | "..") {
             bail!(
                 "{name} is a directory, and services are evaluated: publish it first with: cloudroidctl push {name}; \
                  then: cloudroidctl eval NAME --bag {}",
@@ -148,7 +149,7 @@ impl Eval {
         }
         let address = format!("/api/v1/services/{}", escaped(name));
         let asked = client.get(&address).await;
-        let service: ServiceDetail = asked.map_err(unpublished(name))?;
+        let service: ServiceDetail = asked.map_err(unpublished(name, path.is_dir()))?;
         let interface = &service.interface;
         let is_fed = |topic: &api::interface::Topic| topic.direction == Direction::Input;
         if !interface.topics.iter().any(is_fed) {
@@ -215,7 +216,8 @@ impl Eval {
                 };
                 probe.ask(client, servant).await?
             }
-            _ => Asked::default(),
+            // Nor would it answer from here.
+            _ => Asked::unanswered(point(&measured.calibration).requests),
         };
         let outsourced = Side::outsourced(&measured.calibration, &asked, self.network);
         Ok(Evaluation::new(
@@ -312,10 +314,15 @@ fn out_of_memory(error: anyhow::Error) -> anyhow::Result<String> {
 }
 
 /// What to do about a service that is not there.
-fn unpublished(name: &str) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
-    let next = format!(
-        "name one of those, or publish the package first: cloudroidctl push DIRECTORY --name {name} (--apt {name}, where Debian has it)"
-    );
+fn unpublished(name: &str, is_directory: bool) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
+    let next = match is_directory {
+        true => format!(
+            "{name} is a directory here, and services are evaluated: publish it first with: cloudroidctl push {name}; or name one of those"
+        ),
+        false => format!(
+            "name one of those, or publish the package first: cloudroidctl push DIRECTORY --name {name} (--apt {name}, where Debian has it)"
+        ),
+    };
     move |error| match error.downcast::<Problem>() {
         Ok(problem) if problem.status == 404 => Problem {
             next: Some(next),
@@ -346,19 +353,20 @@ mod tests {
 
     #[test]
     fn an_unknown_service_is_to_be_pushed() {
-        let of = |status| {
+        let of = |status, is_directory| {
             let problem = Problem {
                 status,
                 next: Some("see the list".to_owned()),
                 ..Problem::default()
             };
-            let told = unpublished("people")(problem.into());
+            let told = unpublished("people", is_directory)(problem.into());
             told.downcast::<Problem>()
                 .expect("a problem")
                 .next
                 .unwrap_or_default()
         };
-        assert!(of(404).contains("cloudroidctl push DIRECTORY --name people"));
-        assert_eq!(of(403), "see the list");
+        assert!(of(404, false).contains("cloudroidctl push DIRECTORY --name people"));
+        assert!(of(404, true).contains("people is a directory here"));
+        assert_eq!(of(403, true), "see the list");
     }
 }

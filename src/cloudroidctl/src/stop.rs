@@ -1,5 +1,7 @@
 //! `stop`: ends servants.
 
+use std::collections::BTreeSet;
+
 use api::Stopped;
 
 use crate::client::{Client, escaped};
@@ -30,10 +32,13 @@ impl Stop {
             vec![format!("/api/v1/servants?service={}", escaped(service))]
         } else {
             // All are known before the first is ended.
-            let mut paths = Vec::new();
+            let (mut ids, mut paths) = (BTreeSet::new(), Vec::new());
             for named in &self.servants {
                 let id = inside::servant(client, named).await?;
-                paths.push(format!("/api/v1/servants/{}", escaped(&id)));
+                // One that was ended is not there to be ended again.
+                if ids.insert(id.clone()) {
+                    paths.push(format!("/api/v1/servants/{}", escaped(&id)));
+                }
             }
             paths
         };

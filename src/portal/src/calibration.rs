@@ -10,7 +10,6 @@ use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::response::Response;
-use budget::Permit;
 use choreographer::{Bounds, Requests};
 use futures_util::StreamExt;
 use reach::{Material, Picture, RECORDED};
@@ -21,6 +20,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::api_v1::{lines, recording};
 use super::guard::{Caller, query};
 use crate::app::App;
+use crate::body::Held;
 use crate::errors::Error;
 
 /// Events that a client has not read.
@@ -56,19 +56,13 @@ pub async fn calibration(
     let ending = caller.over(&app, &name);
     let work = async move {
         let outcome = async {
-            let (requests, permit) = match given {
-                Some(held) => (
-                    material(options.source, held.bytes, &events).await?,
-                    held.permit,
-                ),
+            let requests = match given {
+                Some(held) => material(options.source, held, &events).await?,
                 None => live(&app, &caller, &name, &options, &events).await?,
             };
             let choreographer = &app.choreographer;
-            let calibration = choreographer.calibrate(&name, &requests, &options, &events);
-            let calibration = calibration.await?;
-            // Messages were cut from the body, or recorded.
-            drop(permit);
-            Ok::<_, Error>(calibration)
+            let calibration = choreographer.calibrate(&name, requests, &options, &events);
+            Ok::<_, Error>(calibration.await?)
         };
         let event = match outcome.await {
             Ok(calibration) => CalibrationEvent::Done {
@@ -96,9 +90,10 @@ async fn step(events: &mpsc::Sender<CalibrationEvent>, title: String) {
 /// What was sent, as messages.
 async fn material(
     source: Source,
-    bytes: bytes::Bytes,
+    held: Held,
     events: &mpsc::Sender<CalibrationEvent>,
 ) -> Result<Requests, Error> {
+    let Held { bytes, permit } = held;
     let reading = tokio::task::spawn_blocking(move || match source {
         Source::Frames => Picture::read_all(&bytes)
             .map(|(pictures, count)| (Some((pictures.len(), count)), Material::Pictures(pictures)))
@@ -120,6 +115,8 @@ async fn material(
     Ok(Requests {
         material,
         network: None,
+        // Messages were cut from the body.
+        permit,
     })
 }
 
@@ -130,7 +127,7 @@ async fn live(
     service: &str,
     options: &CalibrationOptions,
     events: &mpsc::Sender<CalibrationEvent>,
-) -> Result<(Requests, Permit), Error> {
+) -> Result<Requests, Error> {
     let robot = options.robot.as_deref().unwrap_or_default();
     let bounds = Bounds {
         time: Duration::from_secs_f64(options.seconds.unwrap_or(SECONDS)),

@@ -168,6 +168,7 @@ export interface Fit {
   free_memory: number;
   waiting: number;
   stalled?: string;
+  never?: string;
   full: boolean;
   now: boolean;
   ends: string[];

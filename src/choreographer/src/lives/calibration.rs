@@ -6,6 +6,7 @@ use std::time::Duration;
 use api::Size;
 use api::calibration::{Calibration, CalibrationEvent, CalibrationOptions, Point, TimeSpread};
 use api::trial::Fed;
+use budget::Permit;
 use reach::{Gap, Material, Pace, Reach, Replay};
 use servant::engine::Servant;
 use tokio::sync::mpsc;
@@ -24,6 +25,9 @@ const WHOLE: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(10);
 /// So many requests in vain, one after the other, are enough at a limit.
 const IN_VAIN: usize = 3;
+/// Cores where the push and who measures name none: what was measured becomes a promise, and all cores of the machine promised to
+/// one robot would leave the others none.
+const CORES: f64 = 1.0;
 /// Thousandths of a core below which no servant is limited.
 const LEAST: u64 = 10;
 /// How often its memory is looked at.
@@ -52,6 +56,8 @@ pub struct Requests {
     pub material: Material,
     /// What the network and the stub of a robot added to each of its requests.
     pub network: Option<TimeSpread>,
+    /// Counts the material for whoever sent it.
+    pub permit: Permit,
 }
 
 impl Choreographer {
@@ -60,7 +66,7 @@ impl Choreographer {
     pub async fn calibrate(
         &self,
         service: &str,
-        requests: &Requests,
+        requests: Requests,
         options: &CalibrationOptions,
         events: &mpsc::Sender<CalibrationEvent>,
     ) -> Result<Calibration, Error> {
@@ -75,11 +81,12 @@ impl Choreographer {
             &requests.material,
             options.input.as_deref(),
         )?;
-        let stated = api::Stated {
+        // Set, not stated: what robots may ask for at most bounds no measurement.
+        let set = api::Limits {
             memory: options.memory,
-            ..api::Stated::default()
+            ..api::Limits::default()
         };
-        let measured = self.measured(service, PURPOSE, stated)?;
+        let measured = self.measured(service, PURPOSE, set)?;
         let gave_way = |error| match measured.lease.handle() {
             handle if handle.gave_way() => Error::Calibration(format!(
                 "measuring {service} was given up before it came to anything: {GAVE_WAY}; calibrate on a machine with more room, \
@@ -101,7 +108,7 @@ impl Choreographer {
             sum: Calibration {
                 service: service.to_owned(),
                 revision: measured.lease.handle().revision.number,
-                network: network(requests, options),
+                network: network(&requests, options),
                 memory_margin: decide::MARGIN,
                 ..Calibration::default()
             },
@@ -138,6 +145,8 @@ impl Choreographer {
             }
         }
         let calibration = measuring.proposed();
+        // Whoever asks the servant now sends as much again, and has no more memory than before.
+        drop(requests);
         if let Some(seconds) = options.keep {
             let kept = CalibrationEvent::Kept {
                 servant: measured.lease.handle().id.clone(),
@@ -157,9 +166,8 @@ impl Choreographer {
         options: &CalibrationOptions,
     ) -> Result<Vec<f64>, Error> {
         if options.own {
-            let container = measured.lease.handle().container();
-            let enforced = container.and_then(|container| container.enforced().limits.cpus);
-            return Ok(vec![enforced.unwrap_or(self.inner.options.cores)]);
+            let asked = measured.lease.handle().asked().cpus;
+            return Ok(vec![asked.unwrap_or(self.inner.options.cores.min(CORES))]);
         }
         if !options.cpus.is_empty() {
             let mut named = options.cpus.clone();
@@ -188,7 +196,7 @@ struct Measuring<'a> {
     measured: &'a Measured,
     reach: &'a dyn Reach,
     pace: Pace,
-    /// Its limits stay.
+    /// No limit was named: it is measured as well where this machine limits no cores.
     own: bool,
     aux: BTreeMap<String, String>,
     sum: Calibration,
@@ -198,20 +206,18 @@ impl Measuring<'_> {
     /// Measures at one limit, and notes it; also the times of the requests that were answered, in milliseconds.
     async fn at(&mut self, cpus: f64, material: &Material) -> Result<(Point, Vec<f64>), Error> {
         let handle = self.measured.lease.handle();
-        if !self.own {
-            let change = api::Limits {
-                cpus: Some(cpus),
-                ..api::Limits::default()
-            };
-            self.choreographer.set_limits(&handle.id, change).await?;
-        }
+        let change = api::Limits {
+            cpus: Some(cpus),
+            ..api::Limits::default()
+        };
+        self.choreographer.set_limits(&handle.id, change).await?;
         let container = handle
             .container()
             .ok_or(Error::Internal("measuring a servant"))?;
         let own = self.own;
-        let in_force = || {
-            let enforced = container.enforced().limits.cpus;
-            own || Amount::new(enforced.unwrap_or(0.0), 0) == Amount::new(cpus, 0)
+        let in_force = || match container.enforced().limits.cpus {
+            Some(enforced) => Amount::new(enforced, 0) == Amount::new(cpus, 0),
+            None => own,
         };
         if !in_force() {
             return Err(Error::Calibration(format!(

@@ -34,14 +34,14 @@ pub struct Bounds {
 }
 
 impl Choreographer {
-    /// What `robot` sends to its servant of `service` now; the messages are held in `budget` for as long as the permit lives.
+    /// What `robot` sends to its servant of `service` now; the messages are held in `budget` for as long as they are there.
     pub async fn capture(
         &self,
         service: &str,
         robot: &str,
         bounds: Bounds,
         budget: &Budget,
-    ) -> Result<(Requests, Permit), Error> {
+    ) -> Result<Requests, Error> {
         let handle = self.serving(service, robot)?;
         let container = handle
             .container()
@@ -65,11 +65,11 @@ impl Choreographer {
             .reach()
             .map(|reach| reach.links())
             .unwrap_or_default();
-        let requests = Requests {
+        Ok(Requests {
             material: Material::Bag(messages),
             network: between(links.iter().flat_map(|link| &link.requests)),
-        };
-        Ok((requests, permit))
+            permit,
+        })
     }
 
     /// The servant that works for a robot.

@@ -25,7 +25,7 @@ pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
         robot: handle.robot.clone(),
         anonymous: handle.anonymous,
         created: handle.created,
-        limits: api::Limits::default(),
+        limits: handle.all_asked().set,
         terms: Some(handle.terms()),
     };
     let added = inner.state.add_servant(&record);

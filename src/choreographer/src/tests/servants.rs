@@ -398,13 +398,13 @@ async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
     });
     world.publish("greet", "/eats", |_| {});
     let daemon = world.daemon();
-    let little = api::Stated {
+    let little = api::Limits {
         memory: Some(api::Size(50 << 20)),
-        ..api::Stated::default()
+        ..api::Limits::default()
     };
     // As often as would make a robot without a name wait.
     for _ in 0..5 {
-        let measured = daemon.measured("greet", "calibrate", little.clone());
+        let measured = daemon.measured("greet", "calibrate", little);
         let measured = measured.expect("it is not held up");
         let reason = failure(&measured.lease).await;
         assert!(reason.contains("50M"), "{reason}");

@@ -58,27 +58,26 @@ impl Inputs {
             stays
         });
         for wanted in inputs {
-            let feed = match topics.get(&wanted.topic) {
+            match topics.get(&wanted.topic) {
                 Some(topic) => {
                     self.send_latched(mirror, &wanted.topic);
+                    topic.feed.store(wanted.feed, Ordering::Relaxed);
                     if wanted.feed {
                         self.expect(mirror, &wanted.topic);
                     }
-                    topic.feed.clone()
+                    continue;
                 }
                 None => {
                     let feed = Arc::new(AtomicBool::new(wanted.feed));
                     let reading = read(Arc::downgrade(mirror), wanted.clone(), feed.clone());
                     let topic = Topic {
                         wanted: wanted.clone(),
-                        feed: feed.clone(),
+                        feed,
                         reading: tokio::spawn(reading).abort_handle(),
                     };
                     topics.insert(wanted.topic.clone(), topic);
-                    feed
                 }
-            };
-            feed.store(wanted.feed, Ordering::Relaxed);
+            }
         }
     }
 
@@ -136,19 +135,27 @@ impl Inputs {
 
     /// Opens the topic for who will publish it: in the cloud the node is connected then when the first message comes.
     fn expect(&self, mirror: &Mirror, topic: &str) {
+        // While the cloud is away, nothing is put down for it that it may never be asked for.
+        if !mirror.session().is_up() {
+            return;
+        }
+        let siblings = mirror.siblings.read().clone();
         if let Some(channels) = self.channels.lock().get_mut(topic) {
-            for (publisher, of) in channels.offered.clone() {
+            let mut offered = channels.offered.clone();
+            // Other nodes of the servant hear each other inside.
+            offered.retain(|publisher, _| !siblings.contains(publisher.node()));
+            for (publisher, of) in offered {
                 channels.of(mirror, topic, (&publisher, false), &of);
             }
         }
     }
 
     /// These are there now, and will publish this.
-    fn offered(&self, topic: &str, present: &Matched, inside: impl Fn(&str) -> bool) {
+    fn offered(&self, topic: &str, present: &Matched) {
         let stream = |peer: &Peer| {
             // What is latched comes at once.
             let offer = peer.offer.as_ref().filter(|offer| !offer.latching)?;
-            let known = offer.wire_type.name != "*" && !inside(peer.id.node());
+            let known = offer.wire_type.name != "*";
             known.then(|| (peer.id.clone(), offer.wire_type.clone()))
         };
         let mut channels = self.channels.lock();
@@ -221,10 +228,9 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
                     return;
                 };
                 let present = present.borrow_and_update().clone();
+                // First, or one that has left might be expected again.
+                mirror.inputs.offered(&topic, &present);
                 mirror.inputs.left(&mirror, &topic, &present);
-                // Other nodes of the servant hear each other inside.
-                let siblings = mirror.siblings.read().clone();
-                mirror.inputs.offered(&topic, &present, |node| siblings.contains(node));
                 if feed.load(Ordering::Relaxed) {
                     mirror.inputs.expect(&mirror, &topic);
                 }

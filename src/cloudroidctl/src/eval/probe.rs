@@ -38,13 +38,32 @@ const DEPTH: usize = 16;
 /// What came of it.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Asked {
-    /// Times of the requests in milliseconds, from here to here; none of those that were not answered. The first request is not among
-    /// them.
+    /// Times of the requests in milliseconds, from here to here; none of those that were not answered. The first that was answered is
+    /// not among them, nor those before it; where none was answered, all are.
     pub times: Vec<Option<f64>>,
     /// Bytes of the largest request.
     pub request: usize,
     /// Bytes of the largest answer.
     pub answer: usize,
+}
+
+impl Asked {
+    /// So many requests, none of which was answered.
+    pub fn unanswered(requests: usize) -> Asked {
+        Asked {
+            times: vec![None; requests],
+            ..Asked::default()
+        }
+    }
+
+    /// Notes a request. Until one was answered (`warm`), topics are being connected.
+    fn note(&mut self, took: Option<f64>, warm: &mut bool) {
+        if took.is_some() && !std::mem::replace(warm, true) {
+            self.times.clear();
+        } else {
+            self.times.push(took);
+        }
+    }
 }
 
 /// What is asked.
@@ -125,12 +144,8 @@ impl Probe<'_> {
             if let Some((_, bytes)) = answer {
                 asked.answer = asked.answer.max(bytes);
             }
-            // Until one was answered, topics are being connected.
-            if warm {
-                let took = answer.map(|(at, _)| (at - since).as_secs_f64() * 1000.0);
-                asked.times.push(took);
-            }
-            warm |= answer.is_some();
+            let took = answer.map(|(at, _)| (at - since).as_secs_f64() * 1000.0);
+            asked.note(took, &mut warm);
         }
         Ok(asked)
     }
@@ -342,6 +357,21 @@ mod tests {
             sent: 1,
             from: from.iter().map(|topic| (*topic).to_owned()).collect(),
         }
+    }
+
+    #[test]
+    fn requests_before_the_first_answer_count_where_none_comes() {
+        let noted = |all: &[Option<f64>]| {
+            let (mut asked, mut warm) = (Asked::default(), false);
+            all.iter().for_each(|took| asked.note(*took, &mut warm));
+            asked.times
+        };
+        assert_eq!(noted(&[None; 3]), [None; 3]);
+        assert_eq!(
+            noted(&[None, Some(9.0), Some(2.0), None]),
+            [Some(2.0), None]
+        );
+        assert_eq!(noted(&[Some(9.0), None]), [None]);
     }
 
     #[test]

@@ -225,7 +225,11 @@ mod tests {
                 asked(50.0),
                 "on the robot none of 20 requests was answered within 10 s",
             ),
-            (native(25.0), Asked::default(), "nothing can be said"),
+            (
+                native(25.0),
+                Asked::unanswered(3),
+                "outsourced, none of 3 requests was answered within 10 s",
+            ),
         ] {
             let verdict = evaluated(native, &cloud, &asked).verdict;
             assert!(verdict.contains(words), "{words}: {verdict}");

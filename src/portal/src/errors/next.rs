@@ -227,7 +227,7 @@ fn next_of_choreographer(error: &choreographer::Error) -> String {
             "see the service's revisions with: cloudroidctl services NAME, and how it comes to the next one with: cloudroidctl rollout NAME".into()
         }
         C::OutOfMemory { .. } => {
-            "measure it with more memory, or outsource it: no robot with so little can run it".into()
+            "give it more memory: --robot-memory where it stands for a robot, else push it with a greater --memory".into()
         }
         C::Calibration(_) | C::Shadow(_) => "do what it says, and begin again".into(),
         C::Catalogue(error) => next_of_catalogue(error),

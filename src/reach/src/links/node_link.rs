@@ -8,6 +8,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
+use tokio_util::task::AbortOnDropHandle;
 
 use super::duplicates::Machine;
 use super::held::{Held, Hold};
@@ -369,10 +370,21 @@ async fn obey(
     hub: Arc<Hub>,
     mut orders: mpsc::UnboundedReceiver<(FromRobot, Option<Hold>)>,
 ) {
+    // A node that is slow to connect to one topic keeps nothing else waiting.
+    let mut opening: HashMap<u32, AbortOnDropHandle<()>> = HashMap::new();
     while let Some((order, hold)) = orders.recv().await {
         match order {
-            FromRobot::Open(input) => link.inputs.open(&hub, &link.drops, input).await,
+            FromRobot::Open(input) => {
+                opening.retain(|_, task| !task.is_finished());
+                let (channel, link, hub) = (input.channel, Arc::clone(&link), Arc::clone(&hub));
+                let open = async move { link.inputs.open(&hub, &link.drops, input).await };
+                opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
+            }
             FromRobot::Close { channel } => {
+                // What came before it is given to the node first.
+                if let Some(task) = opening.remove(&channel) {
+                    let _ = task.await;
+                }
                 link.inputs.close(channel);
                 link.session.peer_closed(channel);
             }

@@ -297,3 +297,16 @@ fn every_refusal_says_what_to_do() {
         assert!(!problem.detail.is_empty(), "{error:?}");
     }
 }
+
+#[test]
+fn want_of_memory_is_mended_where_the_memory_was_named() {
+    let error = choreographer::Error::OutOfMemory {
+        service: "people".into(),
+        memory: api::Size(1),
+        ready: true,
+    };
+    let next = Error::from(error).problem().next.unwrap_or_default();
+    for option in ["--robot-memory", "push it with a greater --memory"] {
+        assert!(next.contains(option), "{next}");
+    }
+}
