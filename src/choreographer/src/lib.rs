@@ -210,7 +210,7 @@ impl Choreographer {
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
                 request.robot,
                 request.anonymous,
-                Asked {
+                decide::demand::Asked {
                     set: request.set,
                     ..inner.asked(terms)
                 },

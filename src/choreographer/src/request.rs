@@ -17,7 +17,7 @@ pub struct ServantRequest {
     /// What is stated. Where it is nothing, what was stated before stays.
     pub stated: Stated,
     /// Limits that this daemon sets from the start on, whatever robots may ask for: of what it measures.
-    pub(crate) set: Limits,
+    pub set: Limits,
 }
 
 impl ServantRequest {
