@@ -83,9 +83,14 @@ fn evaluates(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Valu
 }
 
 pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
-    // Cores that it measures with are not promised to other stories' robots.
-    let daemon = world().own("evaluated").start()?;
-    let pushed = [&["push"], PEOPLE.arguments].concat();
+    // Cores that it measures with are not promised to other stories' robots. The recording alone is nearly all that a client may
+    // have held.
+    let setup = world()
+        .own("evaluated")
+        .config("[memory]\nclient = \"5M\"\n");
+    let daemon = setup.start()?;
+    // Robots may ask for less memory than native is measured with.
+    let pushed = [&["push", "--max-memory", "512M"], PEOPLE.arguments].concat();
     daemon.deployer().types(&pushed)?.succeeded()?;
     let recordings = Recordings::new()?;
     let place = world().directory("evaluation")?;
@@ -171,6 +176,9 @@ fn too_little_memory(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Ve
     let verdict = found["verdict"].as_str().unwrap_or_default();
     ensure!(verdict.starts_with("only outsourced: "), "{verdict}");
     ensure!(found["sla"]["has_local"] == false, "{found:#}");
+    // Where nobody names cores, no robot is promised all of the machine's.
+    ensure!(found["outsourced"]["cpus"] == 1.0, "{found:#}");
+    ensure!(found["sla"]["row"]["limits"]["cpus"] == 1.0, "{found:#}");
     none_is_left(daemon, PEOPLE.name)?;
     let status = daemon.api("/api/v1/status")?;
     let failing = status["back_offs"].as_array();
@@ -276,6 +284,7 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
         "cloudroidctl push",
     ];
     refused("unheard_of", &words, &[], &saying)?;
+    named_as_a_directory(&daemon, place.path(), &people)?;
     let directory = binaries::package("teller_py");
     let saying = ["is a directory", "cloudroidctl push"];
     refused(path_str(&directory), &words, &[], &saying)?;
@@ -298,6 +307,23 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
     refused(TELLER.name, &recordings.of("end"), &[], &saying)?;
     none_is_left(&daemon, TELLER.name)?;
     interrupted(&daemon, &words, &plot)
+}
+
+/// Services that have the names of directories where the command is typed.
+fn named_as_a_directory(daemon: &Daemon, place: &Path, bag: &Path) -> Verdict {
+    for (name, saying) in [
+        (TELLER.name, "(it has /camera)"),
+        ("unheard_of", "unheard_of is a directory here"),
+    ] {
+        std::fs::create_dir(place.join(name))?;
+        let outcome = run(Command::new(binaries::path("cloudroidctl"))
+            .current_dir(place)
+            .env("CLOUDROID_HOME", &daemon.home)
+            .env_remove("CLOUDROID_SERVER")
+            .args(["eval", name, "--bag", path_str(bag)]))?;
+        outcome.failed_saying(&[saying])?;
+    }
+    Ok(())
 }
 
 /// Nobody waits for the rest.
