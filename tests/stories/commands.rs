@@ -163,7 +163,14 @@ pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
     types(&["stop", "adder_py"])?.failed_saying(&saying)?;
     drop(two);
     let id = daemon.servant_of("adder_py", "two")?["id"].clone();
-    types(&["stop", id.as_str().context("an id")?])?.succeeded()?;
+    // Who is named twice is ended once.
+    let id = id.as_str().context("an id")?;
+    let stopped = types(&["stop", id, id])?.succeeded()?;
+    ensure!(
+        stopped.stdout.matches(id).count() == 1,
+        "{}",
+        stopped.said()
+    );
     let stopped = types(&["stop", "adder_py"])?.succeeded()?;
     let id = servant["id"].as_str().context("an id")?;
     ensure!(stopped.stdout.contains(id), "{}", stopped.said());

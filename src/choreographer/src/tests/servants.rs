@@ -416,3 +416,28 @@ async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
     lease.ready().await.expect("it has all memory");
     assert!(!lease.handle().was_out_of_memory());
 }
+
+#[tokio::test(start_paused = true)]
+async fn what_robots_may_ask_for_at_most_bounds_no_measurement() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| {
+        record.plan.caps.memory = Some(api::Size(32 << 20));
+    });
+    let daemon = world.daemon();
+    let memory = Some(api::Size(64 << 20));
+    let stated = api::Stated {
+        memory,
+        ..api::Stated::default()
+    };
+    let robot = ServantRequest::new("greet", "r1").stating(stated);
+    let refused = daemon.ensure(robot).err().expect("it is more");
+    assert!(matches!(refused, Error::Terms(_)), "{refused}");
+    let set = api::Limits {
+        memory,
+        ..api::Limits::default()
+    };
+    let measured = daemon.measured("greet", "calibrate", set).expect("a lease");
+    measured.lease.ready().await.expect("ready");
+    assert_eq!(measured.lease.handle().limits().memory, memory);
+    assert_eq!(daemon.admission().look().1.memory, 64 << 20, "promised");
+}

@@ -56,6 +56,35 @@ async fn a_robot_gets_a_servant_whose_nodes_run_already() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn only_what_is_measured_with_so_much_memory_starts_nodes_of_its_own() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = keeps(&world, 1);
+    pool(&daemon, (1, 1)).await;
+    let ahead = world.engine.servants();
+    let memory = Some(api::Size(64 << 20));
+    let set = api::Limits {
+        memory,
+        ..api::Limits::default()
+    };
+    let measured = daemon.measured("greet", "calibrate", set).expect("a lease");
+    measured.lease.ready().await.expect("ready");
+    assert_ne!(ahead, [measured.lease.handle().id.clone()]);
+    drop(measured);
+    pool(&daemon, (1, 1)).await;
+    let ahead = world.engine.servants();
+    let stated = api::Stated {
+        memory,
+        ..api::Stated::default()
+    };
+    let request = ServantRequest::new("greet", "~abc").stating(stated);
+    let lease = daemon.ensure(request.anonymous()).expect("a lease");
+    lease.ready().await.expect("ready");
+    assert!(ahead.contains(&lease.handle().id), "its nodes ran already");
+    daemon.end_warm_pool().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robots_stubs_get_no_servant_whose_nodes_have_other_names() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});

@@ -276,8 +276,7 @@ async fn a_servant_that_is_measured_is_of_the_current_revision_and_judges_none()
     let daemon = keeps(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Percent(100.0)));
     begun.await.expect("it begins");
-    let stated = api::Stated::default();
-    let measured = daemon.measured("greet", "try", stated);
+    let measured = daemon.measured("greet", "try", api::Limits::default());
     let measured = measured.expect("a servant");
     measured.lease.ready().await.expect("ready");
     assert_eq!(measured.lease.handle().revision.number, 1);
