@@ -1,8 +1,10 @@
 //! What was measured so far, one file for each run: an evaluation that was cut off goes on where it stopped, and the report tells of what is
 //! there and of what is not.
 
+use std::collections::BTreeMap;
 use std::io::ErrorKind;
 use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
@@ -11,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::interrupt;
+use crate::report::date;
 
 /// Runs that were measured.
 pub struct Cells {
@@ -18,6 +21,8 @@ pub struct Cells {
     /// What all of them depend on.
     basis: String,
     begun: Instant,
+    /// What was asked for so far: when it was measured, and what came out.
+    used: Mutex<BTreeMap<String, (String, Value)>>,
 }
 
 /// One run.
@@ -26,6 +31,8 @@ struct Cell {
     /// What it depends on; another one is measured anew.
     of: Value,
     measured: Value,
+    /// When: `2026-11-25 18:20`, by this machine's clock.
+    on: String,
 }
 
 /// What a run came to.
@@ -63,6 +70,7 @@ impl Cells {
             directory,
             basis: String::new(),
             begun: Instant::now(),
+            used: Mutex::default(),
         })
     }
 
@@ -86,8 +94,9 @@ impl Cells {
         run: impl FnOnce() -> Result<T>,
     ) -> Result<Measured<T>> {
         let of = serde_json::to_value((&self.basis, of))?;
-        if let Some(measured) = self.known(name, &of) {
-            self.tell(&format!("{name}: measured before"));
+        if let Some((on, measured)) = self.known(name, &of) {
+            self.tell(&format!("{name}: measured before, {on}"));
+            self.note(name, on, serde_json::to_value(&measured)?);
             return Ok(Measured::Done(measured));
         }
         self.tell(name);
@@ -99,8 +108,10 @@ impl Cells {
                 let cell = Cell {
                     of,
                     measured: serde_json::to_value(&measured)?,
+                    on: date(),
                 };
                 self.keep(name, &cell)?;
+                self.note(name, cell.on, cell.measured);
                 Ok(Measured::Done(measured))
             }
             Err(error) => {
@@ -108,6 +119,28 @@ impl Cells {
                 Ok(Measured::Missing(format!("{error:#}")))
             }
         }
+    }
+
+    /// Raw figures of all runs that were asked for and are there, by their names; of maps, their sizes without their cells.
+    pub fn used(&self) -> BTreeMap<String, Value> {
+        let used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        let measured = used.iter().map(|(name, (_, measured))| (name, measured));
+        measured
+            .map(|(name, measured)| (name.clone(), measured.clone()))
+            .collect()
+    }
+
+    /// When the oldest and the newest of them were measured; none where there are none.
+    pub fn dates(&self) -> Option<(String, String)> {
+        let used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        let dates = || used.values().map(|(on, _)| on);
+        Some((dates().min()?.clone(), dates().max()?.clone()))
+    }
+
+    fn note(&self, name: &str, on: String, mut measured: Value) {
+        without_cells(&mut measured);
+        let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
+        used.insert(name.to_owned(), (on, measured));
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -125,10 +158,11 @@ impl Cells {
     }
 
     /// None where it was never measured whole, or depended on something else.
-    fn known<T: DeserializeOwned>(&self, name: &str, of: &Value) -> Option<T> {
+    fn known<T: DeserializeOwned>(&self, name: &str, of: &Value) -> Option<(String, T)> {
         let text = std::fs::read(self.path(name)).ok()?;
         let cell: Cell = serde_json::from_slice(&text).ok()?;
-        (cell.of == *of).then(|| serde_json::from_value(cell.measured).ok())?
+        let measured = (cell.of == *of).then(|| serde_json::from_value(cell.measured).ok())?;
+        Some((cell.on, measured?))
     }
 
     /// Under its name when it is whole.
@@ -138,6 +172,20 @@ impl Cells {
         std::fs::write(&half, serde_json::to_vec(cell)?)
             .with_context(|| half.display().to_string())?;
         Ok(std::fs::rename(half, path)?)
+    }
+}
+
+/// Takes the cells from maps ([`crate::trace::Grid`]): pictures of them are drawn, and they are a hundred times what is left.
+fn without_cells(value: &mut Value) {
+    match value {
+        Value::Array(all) => all.iter_mut().for_each(without_cells),
+        Value::Object(fields) => {
+            if fields.contains_key("resolution") {
+                fields.remove("cells");
+            }
+            fields.values_mut().for_each(without_cells);
+        }
+        _ => {}
     }
 }
 
@@ -188,6 +236,38 @@ mod tests {
         std::fs::write(cells.path("a"), b"{\"of\": 1, \"measu").expect("a file that was cut off");
         let again = cells.measure("a", &1, || Ok(7)).expect("it is kept");
         assert_eq!(again.done(), Some(&7));
+    }
+
+    #[test]
+    fn raw_figures_are_those_of_the_runs_that_were_asked_for() {
+        let (place, cells) = cells();
+        let run =
+            serde_json::json!([0.1234567, {"map": {"width": 1, "resolution": 0.5, "cells": [0]}}]);
+        let told = serde_json::json!([0.1234567, {"map": {"width": 1, "resolution": 0.5}}]);
+        cells.measure("a", &1, || Ok(run)).expect("it is kept");
+        cells.measure("b", &1, || Ok(2)).expect("it is kept");
+        assert_eq!(cells.used()["a"], told);
+        let later = Cells::new(place.path().join("cells"), false).expect("a directory");
+        let again = later.measure::<Value>("a", &1, || bail!("it ran again"));
+        assert!(again.expect("it is read").done().is_some());
+        assert_eq!(later.used(), BTreeMap::from([("a".to_owned(), told)]));
+    }
+
+    #[test]
+    fn the_oldest_and_the_newest_run_are_known() {
+        let (place, cells) = cells();
+        assert_eq!(cells.dates(), None);
+        cells.measure("a", &1, || Ok(1)).expect("it is kept");
+        let old = r#"{"of": ["", 1], "measured": 2, "on": "2001-02-03 04:05"}"#;
+        std::fs::write(cells.path("b"), old).expect("a run of another day");
+        let later = Cells::new(place.path().join("cells"), false).expect("a directory");
+        for name in ["a", "b"] {
+            let known = later.measure::<u32>(name, &1, || bail!("it ran again"));
+            assert!(known.expect("it is read").done().is_some());
+        }
+        let (oldest, newest) = later.dates().expect("two runs");
+        assert_eq!(oldest, "2001-02-03 04:05");
+        assert!(newest > oldest, "{newest}");
     }
 
     #[test]

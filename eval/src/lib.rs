@@ -11,7 +11,10 @@
 #![forbid(unsafe_code)]
 
 pub mod application;
+mod attempts;
+pub mod basis;
 pub mod cells;
+pub mod deadline;
 pub mod estimate;
 pub mod examples;
 pub mod experiments;

@@ -15,8 +15,8 @@ use eval::experiments::crowd::Yard;
 use eval::experiments::{
     codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
 };
-use eval::section::Section;
-use eval::{estimate, examples, interrupt, rehearsal, report, robot, sweep};
+use eval::section::{Missing, Section};
+use eval::{basis, estimate, interrupt, rehearsal, report, robot, sweep};
 
 /// Requests of each run of a quick evaluation.
 const QUICK: usize = 10;
@@ -28,7 +28,7 @@ struct Arguments {
     #[arg(long)]
     quick: bool,
     /// Only the experiments of these numbers.
-    #[arg(long, value_delimiter = ',', value_name = "NUMBERS")]
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", value_parser = clap::value_parser!(u8).range(1..=11))]
     only: Vec<u8>,
     /// Measure again what was measured before.
     #[arg(long)]
@@ -89,7 +89,7 @@ fn evaluate(arguments: &Arguments) -> Result<bool> {
         bench_report::root().join("target").join(name)
     });
     let cells = Cells::new(target.join("cells"), arguments.fresh)?;
-    let cells = cells.based_on(examples::fingerprint()?);
+    let cells = cells.based_on(basis::basis()?);
     interrupt::listen()?;
     for line in sweep::all() {
         eprintln!("left by an evaluation before: {line}");
@@ -104,73 +104,115 @@ fn evaluate(arguments: &Arguments) -> Result<bool> {
         }
         _ => {
             estimate::tell(arguments.quick, &arguments.only);
-            sections(arguments, &cells, &workshop)?
+            sections(arguments, &cells, &workshop)
         }
     };
+    // Before the daemon's end: whatever becomes of that, what was measured is told.
+    let complete = report::write(&target, &sections, &cells)?;
     daemon.ends()?;
-    report::write(&target, &sections)
+    Ok(complete)
 }
 
-fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Result<Vec<Section>> {
+fn sections(arguments: &Arguments, cells: &Cells, workshop: &Workshop) -> Vec<Section> {
     let wanted = |number: u8| arguments.only.is_empty() || arguments.only.contains(&number);
-    let most = arguments.quick.then_some(QUICK);
+    let quick = arguments.quick;
+    let most = quick.then_some(QUICK);
     let mut sections = Vec::new();
     if wanted(1) {
-        sections.push(transparency::section(&transparency::measure(
-            cells, workshop, most,
-        )?));
+        sections.extend(attempt(1, || {
+            let runs = transparency::measure(cells, workshop, most)?;
+            Ok(vec![transparency::section(&runs)])
+        }));
     }
     if [2, 4, 5].into_iter().any(wanted) {
-        let runs = outsourcing::measure(cells, workshop, most)?;
-        let made = [
-            outsourcing::response_times(&runs)?,
-            outsourcing::phases(&runs)?,
-            outsourcing::jitter(&runs)?,
-        ];
-        sections.extend(made.into_iter().filter(|section| wanted(section.number)));
+        sections.extend(attempt(2, || {
+            let runs = outsourcing::measure(cells, workshop, most)?;
+            let mut made = vec![
+                outsourcing::response_times(&runs)?,
+                outsourcing::phases(&runs)?,
+                outsourcing::jitter(&runs)?,
+            ];
+            made.retain(|section| wanted(section.number));
+            Ok(made)
+        }));
     }
     if wanted(2) {
-        let studies = cores::measure(cells, workshop, arguments.quick)?;
-        sections.push(cores::section(&studies)?);
+        sections.extend(attempt(2, || {
+            let studies = cores::measure(cells, workshop, quick)?;
+            Ok(vec![cores::section(&studies)?])
+        }));
     }
     if wanted(3) {
-        sections.push(memory::section(&memory::measure(cells, workshop)?));
+        sections.extend(attempt(3, || {
+            let runs = memory::measure(cells, workshop)?;
+            Ok(vec![memory::section(&runs)])
+        }));
     }
     if wanted(6) {
-        let runs = failover::measure(cells, workshop, arguments.quick)?;
-        sections.push(failover::section(&runs)?);
+        sections.extend(attempt(6, || {
+            let runs = failover::measure(cells, workshop, quick)?;
+            Ok(vec![failover::section(&runs)?])
+        }));
     }
     if wanted(7) {
-        sections.push(map::section(&map::measure(
-            cells,
-            workshop,
-            most.map(|most| most * 3),
-        )?)?);
+        sections.extend(attempt(7, || {
+            let runs = map::measure(cells, workshop, most.map(|most| most * 3))?;
+            Ok(vec![map::section(&runs)?])
+        }));
     }
     if wanted(8) {
-        let runs = codecs::measure(cells, workshop, arguments.quick)?;
-        sections.push(codecs::section(&runs)?);
+        sections.extend(attempt(8, || {
+            let runs = codecs::measure(cells, workshop, quick)?;
+            Ok(vec![codecs::section(&runs)?])
+        }));
     }
     if [9, 10].into_iter().any(wanted) {
-        let place = workshop.directory()?;
-        let mut yard = Yard::new(place.path());
-        if wanted(9) {
-            let runs = neighbours::measure(cells, &mut yard, arguments.quick)?;
-            sections.push(neighbours::section(&runs)?);
-        }
-        if wanted(10) {
-            let runs = scale::measure(cells, &mut yard, arguments.quick)?;
-            sections.push(scale::section(&runs)?);
+        match workshop.directory() {
+            Ok(place) => {
+                let mut yard = Yard::new(place.path());
+                if wanted(9) {
+                    sections.extend(attempt(9, || {
+                        let runs = neighbours::measure(cells, &mut yard, quick)?;
+                        Ok(vec![neighbours::section(&runs)?])
+                    }));
+                }
+                if wanted(10) {
+                    sections.extend(attempt(10, || {
+                        let runs = scale::measure(cells, &mut yard, quick)?;
+                        Ok(vec![scale::section(&runs)?])
+                    }));
+                }
+            }
+            Err(error) => sections.push(failed(9, &error)),
         }
     }
-    if arguments.quick && wanted(11) {
+    if quick && wanted(11) {
         sections.push(later(11, "overhead", "What the system itself adds"));
     }
-    if !arguments.quick && wanted(11) {
-        sections.push(overhead::section(&overhead::measure(cells)?)?);
+    if !quick && wanted(11) {
+        sections.extend(attempt(11, || {
+            let runs = overhead::measure(cells)?;
+            Ok(vec![overhead::section(&runs)?])
+        }));
     }
     sections.sort_by_key(|section| section.number);
-    Ok(sections)
+    sections
+}
+
+/// What the report shows of an experiment, or why there is nothing: one that fails as a whole does not stop the others.
+fn attempt(number: u8, made: impl FnOnce() -> Result<Vec<Section>>) -> Vec<Section> {
+    made().unwrap_or_else(|error| vec![failed(number, &error)])
+}
+
+/// An experiment that failed as a whole.
+fn failed(number: u8, error: &anyhow::Error) -> Section {
+    let title = format!("Experiment {number}");
+    let mut section = Section::new(number, format!("failed-{number}"), title);
+    let why = format!("{error:#}");
+    section
+        .missing
+        .push(Missing::again("the whole experiment", why));
+    section
 }
 
 /// An experiment that a quick evaluation leaves out.

@@ -70,6 +70,9 @@ pub enum Network {
 }
 
 impl Network {
+    /// Each of them.
+    pub const ALL: [Self; 4] = [Self::Lan, Self::Wan, Self::Wifi, Self::Bad];
+
     /// As tables name it.
     pub fn name(self) -> &'static str {
         match self {
@@ -95,6 +98,25 @@ impl Network {
             loss,
             limit: if self == Self::Bad { 100 } else { 1000 },
         }
+    }
+
+    /// Its rules in words.
+    pub fn told(self) -> String {
+        let rules = self.rules();
+        let mut told = format!("{} ms each way", rules.delay);
+        if rules.jitter > 0 {
+            told += &format!(", more or less {} ms", rules.jitter);
+        }
+        told += &format!(", {} Mbit/s", f64::from(rules.rate) / 1e3);
+        if rules.loss > 0.0 {
+            told += &format!(", {} % of packets lost", rules.loss * 100.0);
+        }
+        told
+    }
+
+    /// Seconds that so many bytes take to be sent, at its rate.
+    pub fn takes(self, bytes: usize) -> f64 {
+        8.0 * bytes as f64 / (f64::from(self.rules().rate) * 1e3)
     }
 }
 
@@ -366,6 +388,16 @@ fn spec(id: &str, limits: &Limits) -> ContainerSpec {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_network_is_told_by_its_rules() {
+        assert_eq!(Network::Lan.told(), "1 ms each way, 100 Mbit/s");
+        assert_eq!(
+            Network::Wifi.told(),
+            "5 ms each way, more or less 4 ms, 40 Mbit/s, 1 % of packets lost"
+        );
+        assert!((Network::Bad.takes(250_000) - 1.0).abs() < 1e-9);
+    }
 
     #[test]
     fn a_robot_that_is_killed_is_named() {

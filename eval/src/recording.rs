@@ -11,6 +11,8 @@ use crate::stream;
 
 /// Of pictures.
 const SIZE: (u32, u32) = (640, 480);
+/// Bytes of such a picture.
+pub const PICTURE: usize = (SIZE.0 * SIZE.1 * 3) as usize;
 /// Between two pictures, nanoseconds.
 const PERIOD: u64 = 100_000_000;
 const SECOND: u64 = 1_000_000_000;

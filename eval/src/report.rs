@@ -1,12 +1,15 @@
 //! The files of the report.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, Result};
 use bench_report::Machine;
 use serde::Serialize;
+use serde_json::Value;
 
+use crate::cells::Cells;
 use crate::page;
 use crate::section::{Image, Section};
 
@@ -20,7 +23,7 @@ const STAND_INS: [(&str, &str, &str); 5] = [
     (
         "a GPU in the cloud",
         "none: all computes on processor cores",
-        "this machine has none",
+        "the packages that stand in have no code for one",
     ),
     (
         "a real robot, a Raspberry Pi, an ultrabook",
@@ -44,10 +47,14 @@ struct Whole<'a> {
     made: String,
     machine: Machine,
     sections: &'a [Section],
+    /// When the oldest and the newest of the runs were measured.
+    measured: Option<(String, String)>,
+    /// What was measured, by the runs' names: numbers as they were recorded.
+    runs: BTreeMap<String, Value>,
 }
 
-/// Writes report.html, report.json and one file a figure into `target`; whether nothing is missing.
-pub fn write(target: &Path, sections: &[Section]) -> Result<bool> {
+/// Writes report.html, report.json (with the raw figures of `cells`) and one file a figure into `target`; whether nothing is missing.
+pub fn write(target: &Path, sections: &[Section], cells: &Cells) -> Result<bool> {
     let figures = target.join("figures");
     std::fs::create_dir_all(&figures).with_context(|| figures.display().to_string())?;
     for figure in sections.iter().flat_map(|section| &section.figures) {
@@ -62,15 +69,24 @@ pub fn write(target: &Path, sections: &[Section]) -> Result<bool> {
         "{} × {}, {} GiB, {}, Linux {}",
         machine.processors, machine.processor, machine.memory_gib, machine.system, machine.kernel
     );
-    let made = date();
+    let (made, measured) = (date(), cells.dates());
+    let from_to = match &measured {
+        Some((oldest, newest)) if oldest != newest => {
+            format!("{made}, of what was measured from {oldest} to {newest}")
+        }
+        Some((oldest, _)) => format!("{made}, of what was measured on {oldest}"),
+        None => made.clone(),
+    };
     let stand_ins = STAND_INS
         .map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
     let html = target.join("report.html");
-    std::fs::write(&html, page::render(sections, &told, &made, &stand_ins))?;
+    std::fs::write(&html, page::render(sections, &told, &from_to, &stand_ins))?;
     let whole = Whole {
         made,
         machine,
         sections,
+        measured,
+        runs: cells.used(),
     };
     std::fs::write(
         target.join("report.json"),
@@ -97,7 +113,8 @@ fn summary(sections: &[Section]) {
     }
 }
 
-fn date() -> String {
+/// Now, by this machine's clock.
+pub fn date() -> String {
     let output = Command::new("date").arg("+%Y-%m-%d %H:%M").output();
     let said = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
     said.unwrap_or_default()

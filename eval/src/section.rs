@@ -123,6 +123,9 @@ pub enum Image {
     Png(#[serde(with = "as_base64")] Vec<u8>),
 }
 
+/// What helps where a run failed.
+const AGAIN: &str = "run make eval again: what was measured stays";
+
 /// Something that was to be measured and was not.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Missing {
@@ -142,6 +145,11 @@ impl Missing {
             why: why.into(),
             next: next.into(),
         }
+    }
+
+    /// Something that another run may bring.
+    pub fn again(what: impl Into<String>, why: impl Into<String>) -> Self {
+        Self::new(what, why, AGAIN)
     }
 }
 

@@ -3,14 +3,20 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use sha2::{Digest, Sha256};
+
+use crate::deadline;
 
 /// Of a package's directory.
 const FILE: &str = "models/centernet.onnx";
 /// In the script, before the SHA-256 that the file must have.
 const EXPECTED: &str = "MODEL_SHA256 = \"";
+
+/// For fetching some tens of megabytes.
+const LONGEST: Duration = Duration::from_secs(600);
 
 /// Puts it into `package`, where it is not there yet.
 pub fn put_into(package: &Path) -> Result<()> {
@@ -30,7 +36,11 @@ fn put(package: &Path, cache: &Path) -> Result<()> {
             copy(&kept, &file)?;
             return Ok(());
         }
-        let status = Command::new(&script).status()?;
+        let status = deadline::ends(
+            &mut Command::new(&script).spawn()?,
+            &script.display().to_string(),
+            LONGEST,
+        )?;
         ensure!(
             status.success() && is(&file, expected),
             "the detector's weights could not be fetched ({status}): run {}, which takes them from the registry of npm",

@@ -9,6 +9,7 @@ mod told;
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
+use crate::attempts;
 use crate::cells::{Cells, Measured};
 use crate::examples::{DETECTOR, Where, Workshop};
 use crate::place::{Class, Network, Place};
@@ -279,21 +280,24 @@ fn plan(sources: &Sources, what: &What, directory: &std::path::Path) -> Result<P
     })
 }
 
-/// Publishes the node that answers, unless that was done before.
+/// Publishes the node that answers, unless that was done before or has failed before.
 fn publishes(workshop: &Workshop) -> Result<()> {
     let services = workshop.daemon.deployer().asks(&["services"])?;
     let known = services
         .as_array()
         .is_some_and(|all| all.iter().any(|service| service["name"] == PACKAGE));
-    if !known {
+    if known {
+        return Ok(());
+    }
+    attempts::once(PACKAGE, || {
         eprintln!("pushing {PACKAGE}");
         let with = ["--node", EXECUTABLE, "--cpus", "1", "--memory", "1G"];
         let pushed = workshop.daemon.deployer().pushes(PACKAGE, &with);
         pushed?
             .succeeded()
             .context("pushing the node that answers")?;
-    }
-    Ok(())
+        Ok(())
+    })
 }
 
 fn sent(trace: &Trace, settle: usize) -> Sent {
@@ -301,7 +305,7 @@ fn sent(trace: &Trace, settle: usize) -> Sent {
     Sent {
         responses: counted.iter().filter_map(|one| one.response).collect(),
         lost: counted.iter().filter(|one| one.response.is_none()).count(),
-        carried: per_message(&trace.requests, settle),
+        carried: trace.carried_each(settle),
         each: each(&trace.requests, settle),
         // Without the time and the place in the program that the log puts before it.
         warning: trace.warnings.iter().find_map(|line| {
@@ -309,17 +313,6 @@ fn sent(trace: &Trace, settle: usize) -> Sent {
             words.map(str::to_owned)
         }),
     }
-}
-
-/// Bytes on the cable for each message after the first ones: of the time from one answer to the last one.
-fn per_message(requests: &[Request], settle: usize) -> Option<[f64; 2]> {
-    let known = |(index, request): (usize, &Request)| Some((index, request.carried?));
-    let all: Vec<(usize, [u64; 2])> = requests.iter().enumerate().filter_map(known).collect();
-    let first = all.iter().rfind(|(index, _)| *index < settle)?;
-    let last = all.last().filter(|last| last.0 >= settle)?;
-    let messages = (last.0 - first.0) as f64;
-    let bytes = |way: usize| last.1[way].checked_sub(first.1[way]);
-    Some([bytes(0)? as f64 / messages, bytes(1)? as f64 / messages])
 }
 
 /// Bytes to the servant of each message after the first ones, where its answer and that of the one before came.
@@ -348,15 +341,15 @@ mod tests {
             one(None),
             one(Some([1900, 130])),
         ];
-        assert_eq!(per_message(&requests, 2), Some([300.0, 10.0]));
         assert_eq!(each(&requests, 2), [300]);
-        assert_eq!(per_message(&requests, 0), None);
-        assert_eq!(per_message(&requests[..2], 2), None);
-        let trace = Trace {
+        let trace = |requests: &[Request]| Trace {
             requests: requests.to_vec(),
             ..Trace::default()
         };
-        let sent = sent(&trace, 2);
+        assert_eq!(trace(&requests).carried_each(2), Some([300.0, 10.0]));
+        assert_eq!(trace(&requests).carried_each(0), None);
+        assert_eq!(trace(&requests[..2]).carried_each(2), None);
+        let sent = sent(&trace(&requests), 2);
         assert_eq!((sent.lost, sent.responses.len()), (1, 2));
     }
 

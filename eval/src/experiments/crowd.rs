@@ -11,6 +11,8 @@ use support::binaries;
 use support::daemon::{Daemon, Setup};
 use support::robot::Robot;
 
+use crate::attempts;
+
 /// Below the checkout.
 const PACKAGE: &str = "eval/packages/worker_cpp";
 /// Of its node.
@@ -104,13 +106,17 @@ impl Yard {
     }
 }
 
-/// Publishes a service, unless that was done before.
+/// Publishes a service, unless that was done before or has failed before.
 pub fn publishes(daemon: &Daemon, service: Service) -> Result<()> {
     let services = daemon.deployer().asks(&["services"])?;
     let known = |all: &Vec<Value>| all.iter().any(|one| one["name"] == service.name);
     if services.as_array().is_some_and(known) {
         return Ok(());
     }
+    attempts::once(service.name, || pushes(daemon, service))
+}
+
+fn pushes(daemon: &Daemon, service: Service) -> Result<()> {
     let package = binaries::checkout().join(PACKAGE);
     let package = package.to_str().context("a path of UTF-8")?;
     let milliseconds = format!("milliseconds={}", service.milliseconds);

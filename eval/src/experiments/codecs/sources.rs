@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use bytes::Bytes;
@@ -11,6 +12,7 @@ use support::people::picture;
 
 use super::{CLASS, Kind};
 use crate::cells::{Cells, Measured};
+use crate::deadline;
 use crate::examples::{Input, LASER_SLAM, Where, Workshop};
 use crate::place::{Network, Place};
 use crate::recording::Recording;
@@ -38,6 +40,9 @@ const ROUNDS: usize = 50;
 const HEAD: usize = 99;
 /// Messages that codecs alone are tried with.
 const TRIED: usize = 6;
+
+/// For scaling one photograph.
+const LONGEST: Duration = Duration::from_secs(60);
 
 /// Where messages come from.
 pub(super) struct Sources<'a> {
@@ -158,13 +163,13 @@ fn photographs() -> Result<Vec<Bytes>> {
             "{} is missing; it comes with Debian's opencv-doc: make deps",
             path.display()
         );
-        let output = Command::new("ffmpeg")
+        let mut command = Command::new("ffmpeg");
+        command
             .args(["-v", "error", "-i"])
             .arg(&path)
             .args(["-vf", "scale=640:480", "-frames:v", "1", "-pix_fmt"])
-            .args(["bgr24", "-f", "rawvideo", "-"])
-            .output()
-            .context("ffmpeg")?;
+            .args(["bgr24", "-f", "rawvideo", "-"]);
+        let output = deadline::output(&mut command, LONGEST)?;
         let size = (SIZE.0 * SIZE.1 * 3) as usize;
         ensure!(
             output.status.success() && output.stdout.len() == size,

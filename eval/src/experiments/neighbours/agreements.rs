@@ -2,7 +2,6 @@
 //! with the limits that were promised. All are promised the same part of the machine. Every other robot, beginning with the first, asks
 //! again as soon as it is answered and accepts less than its part gives; the others ask seldom and accept more.
 
-use std::sync::Barrier;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
@@ -11,16 +10,19 @@ use support::daemon::Daemon;
 
 use super::AGAIN;
 use crate::cells::{Cells, Measured};
+use crate::deadline::Meeting;
 use crate::experiments::crowd::{self, Controller, LONG, Yard};
 use crate::plots::{self, Bar};
 use crate::section::{Missing, Section, Table};
 use crate::statistics::{mean, quantile};
-use crate::words::{digits, milliseconds};
+use crate::words::{digits, known, milliseconds};
 
 /// The part of its requests that must be in time for a robot to count.
 const IN_TIME: f64 = 0.95;
 /// Seconds between an answer and the next request of those that ask seldom.
 const SELDOM: f64 = 1.0;
+/// For servants that start beside one another, each within the two minutes of its daemon.
+const START: Duration = Duration::from_secs(300);
 /// Both ways, in the order of the tables.
 const BOTH: [Controller; 2] = [Controller::Off, Controller::On];
 
@@ -100,7 +102,7 @@ fn terms(robots: usize, cores: f64, work: f64) -> (f64, f64, f64) {
 fn beside_each_other(daemon: &Daemon, plan: &Plan) -> Result<Vec<Had>> {
     let (part, eager, patient) = terms(plan.robots, plan.cores, f64::from(plan.work) / 1e3);
     // All begin together: one that is measured while another's servant still starts has its cores, or lacks them.
-    let ready = Barrier::new(plan.robots);
+    let ready = Meeting::of(plan.robots);
     let one = |number: usize| -> Result<Had> {
         let is_eager = number % 2 == 0;
         let (accepts, pause) = if is_eager {
@@ -111,8 +113,10 @@ fn beside_each_other(daemon: &Daemon, plan: &Plan) -> Result<Vec<Had>> {
         let states = format!("&cpus={part:.3}&max_rrt={:.0}ms", accepts * 1e3);
         let joined = crowd::joins(daemon, LONG, &format!("r{number}"), &states);
         let joined = joined.and_then(|mut robot| crowd::call(&mut robot).map(|_| robot));
-        ready.wait();
+        let met = ready.waits(START);
+        // Why one has failed tells more than that the others waited for it.
         let mut robot = joined?;
+        met?;
         let from = Instant::now() + Duration::from_secs_f64(plan.settles);
         let to = from + Duration::from_secs_f64(plan.lasts);
         Ok(Had {
@@ -162,7 +166,7 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
             };
             let share = |had: Option<&Had>| {
                 let share = had.and_then(Had::share);
-                share.map_or_else(|| "–".to_owned(), |share| format!("{:.0}", share * 100.0))
+                known(share, |share| format!("{:.0}", share * 100.0))
             };
             let long =
                 |had: Option<&Had>| milliseconds(had.and_then(|had| quantile(&had.times, 0.95)));

@@ -1,0 +1,142 @@
+//! Programs and threads that are waited for, no longer than they may take.
+
+use std::fs::File;
+use std::io::{Read, Seek};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::{Condvar, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+
+/// Between two looks at whether a program has ended.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Waits until a program has ended.
+///
+/// # Errors
+/// `what`, as which the program is named, has not ended after `longest`: it is killed.
+pub fn ends(child: &mut Child, what: &str, longest: Duration) -> Result<ExitStatus> {
+    let begun = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait()? {
+            return Ok(status);
+        }
+        if begun.elapsed() > longest {
+            let _ = child.kill();
+            let _ = child.wait();
+            bail!(
+                "{what} had not ended after {:.0} s and was killed",
+                longest.as_secs_f64()
+            );
+        }
+        std::thread::sleep(LOOK);
+    }
+}
+
+/// Runs a program to its end, and reads what it says then: files take it, so that nothing that the program has left behind is waited for.
+///
+/// # Errors
+/// It cannot be started, or has not ended after `longest`: it is killed.
+pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
+    let what = command.get_program().to_string_lossy().into_owned();
+    let (out, said) = (tempfile::tempfile()?, tempfile::tempfile()?);
+    let mut child = command
+        .stdin(Stdio::null())
+        .stdout(out.try_clone()?)
+        .stderr(said.try_clone()?)
+        .spawn()
+        .with_context(|| what.clone())?;
+    let status = ends(&mut child, &what, longest)?;
+    let read = |mut file: File| -> Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        file.rewind()?;
+        file.read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    Ok(Output {
+        status,
+        stdout: read(out)?,
+        stderr: read(said)?,
+    })
+}
+
+/// Where threads wait for one another.
+pub struct Meeting {
+    members: usize,
+    came: Mutex<usize>,
+    changed: Condvar,
+}
+
+impl Meeting {
+    /// Of so many threads.
+    pub fn of(members: usize) -> Self {
+        Self {
+            members,
+            came: Mutex::new(0),
+            changed: Condvar::new(),
+        }
+    }
+
+    /// Waits until all have come.
+    ///
+    /// # Errors
+    /// After `longest` some have not: they broke, or hang.
+    pub fn waits(&self, longest: Duration) -> Result<()> {
+        let mut came = self.came.lock().unwrap_or_else(PoisonError::into_inner);
+        *came += 1;
+        self.changed.notify_all();
+        let lacks = |came: &mut usize| *came < self.members;
+        let (came, _) = self
+            .changed
+            .wait_timeout_while(came, longest, lacks)
+            .unwrap_or_else(PoisonError::into_inner);
+        ensure!(
+            *came >= self.members,
+            "only {} of {} threads were ready after {:.0} s",
+            *came,
+            self.members,
+            longest.as_secs_f64()
+        );
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_program_says_is_read() {
+        let mut command = Command::new("sh");
+        // What is left in the background holds its output open, and is not waited for.
+        command.args(["-c", "sleep 5 & echo out; echo said >&2; exit 3"]);
+        let begun = Instant::now();
+        let output = output(&mut command, Duration::from_secs(60)).expect("it ends");
+        assert_eq!(
+            (&output.stdout[..], &output.stderr[..]),
+            (&b"out\n"[..], &b"said\n"[..])
+        );
+        assert_eq!(output.status.code(), Some(3));
+        assert!(begun.elapsed() < Duration::from_secs(4));
+    }
+
+    #[test]
+    fn who_does_not_come_is_not_waited_for() {
+        let alone = Meeting::of(2);
+        let error = alone.waits(Duration::ZERO).expect_err("one is lacking");
+        assert!(error.to_string().starts_with("only 1 of 2"), "{error}");
+        alone
+            .waits(Duration::from_secs(60))
+            .expect("both have come");
+    }
+
+    #[test]
+    fn a_program_that_takes_too_long_is_killed() {
+        let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
+        let error = ends(&mut child, "sleep", Duration::ZERO).expect_err("it takes a minute");
+        assert!(error.to_string().contains("sleep had not ended"), "{error}");
+        let mut child = Command::new("false").spawn().expect("false");
+        let status = ends(&mut child, "false", Duration::from_secs(60)).expect("it ends");
+        assert_eq!(status.code(), Some(1));
+    }
+}
