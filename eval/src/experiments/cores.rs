@@ -31,6 +31,7 @@ pub struct Subject {
     /// Threads that it computes with.
     threads: usize,
     fitted: &'static [f64],
+    /// Some between those, and one beyond the greatest of them: what is predicted lies beyond, too.
     held_back: &'static [f64],
     requests: usize,
 }
@@ -41,8 +42,8 @@ const SUBJECTS: [Subject; 3] = [
         name: "laser_slam",
         arguments: &[],
         threads: 1,
-        fitted: &[0.25, 0.5, 1.0, 1.5],
-        held_back: &[0.35, 0.75, 1.25],
+        fitted: &[0.25, 0.5, 1.0, 1.25],
+        held_back: &[0.35, 0.75, 1.5],
         requests: 60,
     },
     Subject {
@@ -50,8 +51,8 @@ const SUBJECTS: [Subject; 3] = [
         name: "object_detector, 1 thread",
         arguments: &[],
         threads: 1,
-        fitted: &[0.25, 0.5, 1.0, 1.5],
-        held_back: &[0.35, 0.75, 1.25],
+        fitted: &[0.25, 0.5, 1.0, 1.25],
+        held_back: &[0.35, 0.75, 1.5],
         requests: 16,
     },
     Subject {
@@ -59,16 +60,16 @@ const SUBJECTS: [Subject; 3] = [
         name: "object_detector, 2 threads",
         arguments: &["_threads:=2"],
         threads: 2,
-        fitted: &[0.25, 0.5, 1.0, 1.75],
-        held_back: &[0.35, 0.75, 1.5],
+        fitted: &[0.25, 0.5, 1.0, 1.5],
+        held_back: &[0.35, 0.75, 1.25, 1.75],
         requests: 16,
     },
 ];
 
 /// What a quick evaluation measures.
 const QUICK: Subject = Subject {
-    fitted: &[0.25, 0.5, 1.0],
-    held_back: &[0.75],
+    fitted: &[0.25, 0.5, 0.75],
+    held_back: &[0.35, 1.0],
     requests: 10,
     ..SUBJECTS[0]
 };
@@ -171,11 +172,45 @@ fn outsourced(workshop: &Workshop, subject: &Subject, cores: f64) -> Result<Read
     })
 }
 
+/// What a limit is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Use {
+    /// The model is fitted to it.
+    Fitted,
+    /// The model has not seen it, but smaller ones and greater ones.
+    Inside,
+    /// The model has seen only smaller ones.
+    Beyond,
+}
+
+impl Use {
+    /// As tables name it.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Fitted => "fitting",
+            Self::Inside => "held back, inside",
+            Self::Beyond => "held back, beyond",
+        }
+    }
+}
+
+impl Subject {
+    fn uses(&self, cores: f64) -> Use {
+        if self.fitted.contains(&cores) {
+            Use::Fitted
+        } else if self.fitted.iter().all(|fitted| *fitted < cores) {
+            Use::Beyond
+        } else {
+            Use::Inside
+        }
+    }
+}
+
 /// What one program's runs come to.
 struct Found<'a> {
     study: &'a Study,
-    /// Cores, parts, whether the model was fitted to them.
-    points: Vec<(f64, Parts, bool)>,
+    /// Cores, parts, what they are for.
+    points: Vec<(f64, Parts, Use)>,
     model: Option<Model>,
     /// Mean response time on the robot itself, seconds.
     native: Option<f64>,
@@ -186,10 +221,10 @@ impl<'a> Found<'a> {
         let mut points = Vec::new();
         for (cores, measured) in &study.runs {
             let parts = measured.done().and_then(|run| parts(&run.trace));
-            let fitted = study.subject.fitted.contains(cores);
-            points.extend(parts.map(|parts| (*cores, parts, fitted)));
+            let of = study.subject.uses(*cores);
+            points.extend(parts.map(|parts| (*cores, parts, of)));
         }
-        let fitted = points.iter().filter(|point| point.2);
+        let fitted = points.iter().filter(|point| point.2 == Use::Fitted);
         let fitted: Vec<(f64, Parts)> = fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
         let native = study.native.done().and_then(parts);
         Self {
@@ -204,13 +239,13 @@ impl<'a> Found<'a> {
         self.study.subject.name
     }
 
-    /// (predicted, measured) at the points that the model has not seen.
-    fn held_back(&self) -> Vec<(f64, f64)> {
-        let unseen = self.points.iter().filter(|point| !point.2);
-        let pair = |(cores, parts, _): &(f64, Parts, bool)| {
-            Some((self.model?.cautious(*cores), total(*parts)))
+    /// (predicted, measured) at the points that are for this, by this prediction of the model.
+    fn pairs(&self, of: Use, predict: fn(&Model, f64) -> f64) -> Vec<(f64, f64)> {
+        let those = self.points.iter().filter(|point| point.2 == of);
+        let pair = |(cores, parts, _): &(f64, Parts, Use)| {
+            Some((predict(&self.model?, *cores), total(*parts)))
         };
-        unseen.filter_map(pair).collect()
+        those.filter_map(pair).collect()
     }
 }
 

@@ -10,7 +10,7 @@ use crate::statistics::quantile;
 use crate::trace::Trace;
 use crate::words::milliseconds;
 
-/// The detector with pictures of this size in its network needs some 1.4 GB.
+/// The detector with pictures of this size in its network needs more than a gigabyte.
 const LARGE: [&str; 2] = ["_width:=2048", "_height:=2048"];
 /// Requests of each run.
 const REQUESTS: usize = 5;
@@ -69,7 +69,7 @@ pub fn section(runs: &Runs) -> Section {
     );
     section.published = "The publication could not run SSD on the Raspberry Pi, whose memory does not hold it; outsourced it answered.".to_owned();
     section.differs = vec![
-        "object_detector with pictures of 2048x2048 in its network stands in for SSD: it needs some 1.4 GB, and the robot has 1 GiB. The limit is the kernel's, as on a robot without swap."
+        "object_detector with pictures of 2048x2048 in its network stands in for SSD; the robot has 1 GiB. The limit is the kernel's, as on a robot without swap."
             .to_owned(),
     ];
     let mut table = Table::new(
@@ -79,7 +79,7 @@ pub fn section(runs: &Runs) -> Section {
             "requests answered",
             "published",
             "processes ended for want of memory",
-            "median, ms",
+            "median (ms)",
         ],
     );
     for (name, published, run) in [
@@ -94,11 +94,7 @@ pub fn section(runs: &Runs) -> Section {
                 cost.killed_for_memory.to_string(),
                 milliseconds(quantile(&trace.responses(), 0.5)),
             ]),
-            Measured::Missing(why) => section.missing.push(Missing {
-                what: name.to_owned(),
-                why: why.clone(),
-                next: "run make eval again".to_owned(),
-            }),
+            Measured::Missing(why) => section.missing.push(Missing::again(name, why)),
         }
     }
     section.tables.push(table);

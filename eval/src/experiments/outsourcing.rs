@@ -11,7 +11,7 @@ use crate::plots::{self, Bar, Series};
 use crate::section::{Missing, Section, Table};
 use crate::statistics::{mean, quantile, standard_deviation};
 use crate::trace::{Phases, Trace};
-use crate::words::{milliseconds, ratio};
+use crate::words::{known, milliseconds, ratio};
 
 /// Where one package ran.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -135,11 +135,12 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
             "answered",
             "median",
             "95 %",
-            "accumulated, s",
-            "times as fast",
+            "accumulated (s)",
+            "times as fast, by medians",
+            "times as fast, by means",
             "published",
-            "robot's CPU a request, ms",
-            "bytes a request",
+            "robot's CPU, whole run (s)",
+            "bytes a request, both ways",
         ],
     );
     for run in runs {
@@ -148,10 +149,11 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
         };
         let responses = trace.responses();
         let native = find(runs, run.example.name, run.class, SetUp::Native);
-        let native = native.and_then(|(trace, _)| quantile(&trace.responses(), 0.5));
+        let native = native.map(|(trace, _)| trace.responses());
         let median = quantile(&responses, 0.5);
-        let faster = native.zip(median).map(|(native, median)| native / median);
-        let many = trace.requests.len().max(1) as f64;
+        let times =
+            |of: &dyn Fn(&[f64]) -> Option<f64>| Some(of(native.as_ref()?)? / of(&responses)?);
+        let faster = times(&|all| quantile(all, 0.5));
         table.push([
             run.example.name.to_owned(),
             run.class.name().to_owned(),
@@ -162,12 +164,25 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
             milliseconds(quantile(&responses, 0.95)),
             format!("{:.1}", responses.iter().sum::<f64>()),
             ratio(faster),
+            ratio(times(&|all| mean(all))),
             published(run.set_up),
-            format!("{:.0}", cost.robot_cpu / many * 1e3),
-            format!("{:.0}", (cost.sent + cost.received) as f64 / many),
+            format!("{:.1}", cost.robot_cpu),
+            known(trace.carried_each(1), |ways| {
+                format!("{:.0}", ways[0] + ways[1])
+            }),
         ]);
         if let (Some(faster), SetUp::Behind(network)) = (faster, run.set_up) {
             section.findings.push(finding(run, network, faster));
+        }
+        let lost = trace.requests.len() - trace.answered();
+        if lost > 0 {
+            section.findings.push(format!(
+                "{}, {}, {}: {lost} of {} requests were never answered, and times are those of the others.",
+                run.example.name,
+                run.class.name(),
+                run.set_up.name(),
+                trace.requests.len()
+            ));
         }
     }
     section.tables.push(table);
@@ -186,7 +201,7 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
         section.drawing(
             format!("outsourcing-{}", example.name),
             format!("{title}: response time of each request"),
-            plots::lines(&title, "request", "response time, s", &series(each), true)?,
+            plots::lines(&title, "request", "response time (s)", &series(each), true)?,
         );
         section.drawing(
             format!("outsourcing-{}-accumulated", example.name),
@@ -194,7 +209,7 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
             plots::lines(
                 &title,
                 "request",
-                "accumulated, s",
+                "accumulated response times (s)",
                 &series(accumulated),
                 false,
             )?,
@@ -216,7 +231,12 @@ fn differs() -> Vec<String> {
     [
         "The published packages are not packaged for this system: laser_slam (scan matching), graph_slam (a graph of poses, whose steps take longer as it grows) and object_detector (a neural network) stand in; the SLAM packages work on a recorded drive of MRPT.",
         "A Raspberry Pi is a quarter of a core of this machine and 1 GiB, an ultrabook half a core and 4 GiB; the cloud has one core for each servant. With that few cores no factor of 25 can come about: one core is four times a quarter.",
-        "Networks are delays, rates and losses between two namespaces of this machine (LAN: 1 ms each way, 100 Mbit/s; WAN: 30 ms each way, 20 Mbit/s).",
+        &format!(
+            "Networks are delays, rates and losses between two namespaces of this machine (LAN: {}; WAN: {}).",
+            Network::Lan.told(),
+            Network::Wan.told()
+        ),
+        "The model of cores beside this predicts means, because only means follow a limit of a fraction of a core: the column by means is to be compared with it.",
     ]
     .map(str::to_owned)
     .to_vec()
@@ -230,7 +250,7 @@ fn finding(run: &Run, network: Network, faster: f64) -> String {
         );
     }
     format!(
-        "{name} answers more slowly outsourced by {network} than on a robot of the class {class} ({faster:.2} times as fast): its own computation takes less time there than the network adds."
+        "{name} answers more slowly outsourced by {network} than on a robot of the class {class} ({faster:.2} times as fast): the way to the cloud and back takes longer than what its processor saves."
     )
 }
 
@@ -277,7 +297,10 @@ pub fn phases(runs: &[Run]) -> Result<Section> {
         let Some((trace, _)) = run.measured.done() else {
             continue;
         };
-        let told = trace.phases();
+        // Of the same requests all: one whose parts are not known counts in none of the means.
+        let both = trace.requests.iter();
+        let both = both.filter_map(|one| Some((one.response?, one.phases?)));
+        let (responses, told): (Vec<f64>, Vec<Phases>) = both.unzip();
         if told.is_empty() {
             section.missing.push(Missing {
                 what: format!("phases, {}, {}", run.class.name(), run.set_up.name()),
@@ -293,9 +316,15 @@ pub fn phases(runs: &[Run]) -> Result<Section> {
             of(|one| one.rendering),
         ];
         let own: f64 = parts.iter().flatten().sum();
-        let whole = mean(&trace.responses());
+        let whole = mean(&responses);
         let rest = whole.map(|whole| whole - own);
         let group = format!("{}, {}", run.class.name(), run.set_up.name());
+        let shares = [parts[1], rest].map(|part| Some(100.0 * part? / whole?));
+        if let [Some(computation), Some(transport)] = shares {
+            section.findings.push(format!(
+                "{group}: computation is {computation:.0} % of the response time, transport and waiting {transport:.0} %."
+            ));
+        }
         for (name, part) in ["acquisition", "computation", "rendering", "transport"]
             .into_iter()
             .zip(parts.into_iter().chain([rest]))
@@ -318,7 +347,7 @@ pub fn phases(runs: &[Run]) -> Result<Section> {
     section.drawing(
         "phases",
         "Parts of one frame's response time",
-        plots::bars("laser_slam", "ms", &bars, false)?,
+        plots::bars("laser_slam", "time (ms)", &bars, false)?,
     );
     missing(
         &mut section,
@@ -375,6 +404,14 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
             at(0.95),
             at(0.99),
         ]);
+        let native = find(runs, run.example.name, run.class, SetUp::Native);
+        let native = native.and_then(|(trace, _)| standard_deviation(&trace.responses()));
+        if let (SetUp::Behind(network), Some((native, here))) = (run.set_up, native.zip(deviation))
+        {
+            section
+                .findings
+                .push(steadier(run, network, (native, here)));
+        }
     }
     section.tables.push(table);
     for example in ALL {
@@ -387,11 +424,28 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
         section.drawing(
             format!("jitter-{}", example.name),
             format!("{}: share of requests answered within a time", example.name),
-            plots::distribution(example.name, "response time, s", &series, true)?,
+            plots::distribution(example.name, "response time (s)", &series, true)?,
         );
     }
     missing(&mut section, runs);
     Ok(section)
+}
+
+/// By the standard deviations natively and outsourced, seconds.
+fn steadier(run: &Run, network: Network, (native, here): (f64, f64)) -> String {
+    let words = if here < native {
+        "differ less"
+    } else {
+        "do not differ less, which is worse than hoped"
+    };
+    format!(
+        "{} by {}: response times {words} outsourced (standard deviation {} ms) than on a robot of the class {} ({} ms).",
+        run.example.name,
+        network.name(),
+        milliseconds(Some(here)),
+        run.class.name(),
+        milliseconds(Some(native))
+    )
 }
 
 /// Names what was not measured.
@@ -404,11 +458,7 @@ fn missing<R: std::borrow::Borrow<Run>>(section: &mut Section, runs: &[R]) {
             run.set_up.name()
         );
         match &run.measured {
-            Measured::Missing(why) => section.missing.push(Missing {
-                what,
-                why: why.clone(),
-                next: "run make eval again: what was measured stays".to_owned(),
-            }),
+            Measured::Missing(why) => section.missing.push(Missing::again(what, why)),
             Measured::Done((trace, _)) => {
                 if let Some(why) = &trace.node_ended {
                     section.missing.push(Missing {
@@ -463,7 +513,8 @@ mod tests {
             .map(|row| row[8].as_str())
             .collect();
         assert_eq!(faster, ["1.0", "4.0", "0.50"]);
-        assert_eq!(section.tables[0].rows[1][9], "up to 25");
+        assert_eq!(section.tables[0].rows[1][9], "1.1");
+        assert_eq!(section.tables[0].rows[1][10], "up to 25");
         assert!(
             section.findings[0].contains("4.0 times as fast"),
             "{:?}",
@@ -490,6 +541,21 @@ mod tests {
         let Run { measured, .. } = run(SetUp::Native, &[1.0, 2.0, 3.0]);
         let sums = accumulated(&measured.done().expect("it is").0);
         assert_eq!(sums, [(1.0, 1.0), (2.0, 3.0), (3.0, 6.0)]);
+    }
+
+    #[test]
+    fn jitter_is_compared_with_that_of_the_robot() {
+        let runs = [
+            run(SetUp::Native, &[0.3, 0.5]),
+            run(SetUp::Behind(Network::Lan), &[0.1, 0.1]),
+            run(SetUp::Behind(Network::Wan), &[0.1, 0.9]),
+        ];
+        let section = jitter(&runs).expect("a section");
+        let [lan, wan] = &section.findings[..] else {
+            panic!("{:?}", section.findings);
+        };
+        assert!(lan.contains("LAN: response times differ less"), "{lan}");
+        assert!(wan.contains("worse than hoped"), "{wan}");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use anyhow::Result;
 use crate::cells::{Cells, Measured};
 use crate::plots::{self, Bar};
 use crate::section::{Missing, Section, Table};
-use crate::words::{digits, ratio};
+use crate::words::{digits, known, ratio};
 
 use super::benches::{self, Written};
 
@@ -57,7 +57,6 @@ fn needed<'a>(
     what: &str,
     measured: &'a Measured<Written>,
 ) -> Option<&'a Written> {
-    let next = "make eval again: what was measured stays";
     match measured {
         Measured::Done(written) => {
             for one in written.left_out.iter().filter(|one| one.what != SUITE) {
@@ -71,7 +70,7 @@ fn needed<'a>(
             Some(written)
         }
         Measured::Missing(why) => {
-            section.missing.push(Missing::new(what, why, next));
+            section.missing.push(Missing::again(what, why));
             None
         }
     }
@@ -172,7 +171,7 @@ fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
         section.drawing(
             id,
             format!("Start times: {group}"),
-            plots::bars("start times", "ms", &of, true)?,
+            plots::bars("start times", "start time (ms)", &of, true)?,
         );
     }
     Ok(())
@@ -228,7 +227,7 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
         ],
     );
     let mut row = |way: &str, median: Option<f64>, late: Option<f64>| {
-        let told = |time: Option<f64>| time.map_or_else(|| "–".to_owned(), digits);
+        let told = |time: Option<f64>| known(time, digits);
         let both = median.zip(direct);
         table.push([
             way.to_owned(),

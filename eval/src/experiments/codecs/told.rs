@@ -9,7 +9,7 @@ use crate::place::Network;
 use crate::plots::{self, Bar};
 use crate::section::{Missing, Section, Table};
 use crate::statistics::quantile;
-use crate::words::milliseconds;
+use crate::words::{self, known, milliseconds};
 
 /// A message is encoded if it takes less than this share of the bytes without a codec.
 const SMALLER: f64 = 0.9;
@@ -40,7 +40,7 @@ pub fn section(runs: &Runs) -> Result<Section> {
     section.drawing(
         "codecs-saved",
         "Share of the bytes on the cable that each codec saves over the LAN, beside the published one",
-        plots::bars("Saved bytes", "%", &bars, false)?,
+        plots::bars("Saved bytes", "saved bytes (%)", &bars, false)?,
     );
     let responses: Vec<Bar> = done(runs)
         .filter(|(what, _)| what.kind == Kind::Video)
@@ -57,7 +57,12 @@ pub fn section(runs: &Runs) -> Result<Section> {
     section.drawing(
         "codecs-response",
         "Response time of one picture of the video by codec and network: median, 5 % and 95 %",
-        plots::bars("From picture to receipt", "ms", &responses, true)?,
+        plots::bars(
+            "From picture to receipt",
+            "response time (ms)",
+            &responses,
+            true,
+        )?,
     );
     section.findings = findings(runs);
     missing(&mut section, runs);
@@ -76,7 +81,8 @@ fn differs() -> Vec<String> {
             HURRY.1
         ),
         "The publication's video, image and map are not published: the video is vtest.avi of Debian's opencv-doc, images are photographs of the same package, scaled to 640x480, bgr8, the map is what laser_slam makes of a recorded drive, alone and in the middle of 4000 x 4000 cells, as gmapping publishes it.".to_owned(),
-        "No camera's picture becomes 96 % smaller by deflate, which loses nothing: what deflate and zlib make of the same messages, in one process, is in the last table.".to_owned(),
+        "What deflate and zlib, which lose nothing, make of the same messages in one process is in the last table, beside what they saved in the publication.".to_owned(),
+        "Photographs and the large map are sent over the LAN alone; no codec but those of stub.toml can be had on the cable.".to_owned(),
     ]
 }
 
@@ -125,17 +131,13 @@ pub(super) fn base<'a>(runs: &'a Runs, what: &What) -> Option<(&'a What, &'a Sen
     })
 }
 
+/// Of what is percent already.
 fn percent(value: Option<f64>) -> String {
-    // Adding nothing makes zero of what is rounded to minus zero.
-    let rounded = |value: f64| (value * 10.0).round() / 10.0 + 0.0;
-    value.map_or_else(
-        || "–".to_owned(),
-        |value| format!("{:.1} %", rounded(value)),
-    )
+    words::percent(value.map(|value| value / 100.0))
 }
 
 fn bytes(value: Option<f64>) -> String {
-    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.0}"))
+    known(value, |value| format!("{value:.0}"))
 }
 
 fn saved(runs: &Runs) -> Table {
@@ -147,11 +149,11 @@ fn saved(runs: &Runs) -> Table {
             "published row",
             "published: saved",
             "saved here",
-            "of a message that was encoded",
+            "of the median message that is a tenth smaller",
             "bytes to the servant",
             "bytes back",
-            "messages encoded",
-            "PSNR, median (least), dB",
+            "messages at least a tenth smaller",
+            "PSNR, median, and least in brackets (dB)",
             "pictures that changed",
         ],
     );
@@ -172,10 +174,9 @@ fn saved(runs: &Runs) -> Table {
             percent(where_encoded(runs, what, sent)),
             bytes(sent.carried.map(|ways| ways[0])),
             bytes(sent.carried.map(|ways| ways[1])),
-            encoded(runs, what, sent).map_or_else(
-                || "–".to_owned(),
-                |encoded| format!("{encoded} of {}", sent.each.len()),
-            ),
+            known(encoded(runs, what, sent), |encoded| {
+                format!("{encoded} of {}", sent.each.len())
+            }),
             noise,
             changed,
         ]);
@@ -216,7 +217,7 @@ fn times(runs: &Runs) -> Table {
             "95 %",
             "bytes to the servant",
             "saved",
-            "messages encoded",
+            "messages at least a tenth smaller",
         ],
     );
     for (what, sent) in done(runs) {
@@ -233,10 +234,9 @@ fn times(runs: &Runs) -> Table {
                 Setting::None => "the base".to_owned(),
                 _ => percent(saving(runs, what, sent)),
             },
-            encoded(runs, what, sent).map_or_else(
-                || "–".to_owned(),
-                |encoded| format!("{encoded} of {}", sent.each.len()),
-            ),
+            known(encoded(runs, what, sent), |encoded| {
+                format!("{encoded} of {}", sent.each.len())
+            }),
         ]);
     }
     table
@@ -386,9 +386,9 @@ mod tests {
             told.contains("takes longer with the codec (90.0 ms)"),
             "{told}"
         );
-        assert!(told.contains("1 of 2 messages went as they are"), "{told}");
+        assert!(told.contains("1 of 2 messages took nine tenths"), "{told}");
         assert!(
-            told.contains("image makes 160 bytes of a message where deflate makes 150"),
+            told.contains("image makes 160 bytes of the same messages of which deflate makes 150"),
             "{told}"
         );
         assert!(section.missing.is_empty(), "{:?}", section.missing);

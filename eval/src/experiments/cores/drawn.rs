@@ -6,31 +6,32 @@ use crate::plots::{self, Series};
 
 use super::model::Model;
 use super::told::PUBLISHED;
-use super::{Found, total};
+use super::{Found, Use, total};
 
 /// The model, points that were fitted, and points that were held back.
 pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
-    let of = |fitted: bool| {
-        let chosen = one.points.iter().filter(move |point| point.2 == fitted);
+    let of = |of: Use| {
+        let chosen = one.points.iter().filter(move |point| point.2 == of);
         chosen.map(|point| (point.0, total(point.1))).collect()
     };
-    let least = one
-        .points
-        .iter()
-        .map(|point| point.0)
-        .fold(model.most, f64::min);
-    let steps = (0..=300).map(|step| least + (model.most - least) * f64::from(step) / 300.0);
+    let cores = || one.points.iter().map(|point| point.0);
+    let (least, most) = (
+        cores().fold(model.most, f64::min),
+        cores().fold(model.most, f64::max),
+    );
+    let steps = (0..=300).map(|step| least + (most - least) * f64::from(step) / 300.0);
     let curve = steps.map(|cores| (cores, model.cautious(cores))).collect();
     // Points stand upon the curve.
     let series = [
         Series::new("model", curve),
-        Series::new("fitted", of(true)),
-        Series::new("held back", of(false)),
+        Series::new("fitted", of(Use::Fitted)),
+        Series::new(Use::Inside.name(), of(Use::Inside)),
+        Series::new(Use::Beyond.name(), of(Use::Beyond)),
     ];
     plots::points(
         one.name(),
         "cores of the servant",
-        "mean response time, s",
+        "mean response time (s)",
         &series,
         false,
     )

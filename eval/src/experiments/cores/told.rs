@@ -6,11 +6,11 @@ use crate::cells::Measured;
 use crate::plots;
 use crate::section::{Missing, Section, Table};
 use crate::statistics::root_mean_square_error;
-use crate::words::{digits, milliseconds, ratio};
+use crate::words::{digits, known, milliseconds, percent, ratio};
 
 use super::drawn::{curve, factors};
-use super::model::{Model, NAMES, bytes, parts};
-use super::{Found, Study, total};
+use super::model::{Model, NAMES, parts};
+use super::{Found, Study, Use, total};
 
 /// Cores for which response times are predicted.
 const MANY: [f64; 4] = [4.0, 8.0, 16.0, 32.0];
@@ -48,7 +48,7 @@ pub fn section(studies: &[Study]) -> Result<Section> {
         plots::lines(
             "times as fast as a robot of the class Pi",
             "cores",
-            "times",
+            "times as fast",
             &factors(&found),
             true,
         )?,
@@ -75,7 +75,7 @@ fn measured(found: &[Found]) -> Table {
         "cores",
         "used for",
         "requests",
-        "bytes a request",
+        "bytes a request, both ways",
     ];
     let tail = ["response time", "model", "model's error"];
     let mut table = Table::new(
@@ -85,27 +85,29 @@ fn measured(found: &[Found]) -> Table {
     for one in found {
         for (cores, measured) in &one.study.runs {
             let point = one.points.iter().find(|point| point.0 == *cores);
-            let (Some(run), Some((_, parts, fitted))) = (measured.done(), point) else {
+            let (Some(run), Some((_, parts, of))) = (measured.done(), point) else {
                 continue;
             };
             let (whole, model) = (total(*parts), one.model.map(|model| model.cautious(*cores)));
             let mut row = vec![
                 one.name().to_owned(),
                 digits(run.enforced),
-                if *fitted { "fitting" } else { "held back" }.to_owned(),
+                of.name().to_owned(),
                 run.trace.answered().to_string(),
-                format!("{:.0}", bytes(&run.trace, &run.cost)),
+                known(run.trace.carried_each(1), |ways| {
+                    format!("{:.0}", ways[0] + ways[1])
+                }),
             ];
             row.extend(parts.map(|part| milliseconds(Some(part))));
             row.extend([Some(whole), model].map(milliseconds));
-            row.push(model.map_or_else(String::new, |model| percent(model / whole - 1.0)));
+            row.push(known(model, |model| more_or_less(model / whole - 1.0)));
             table.push(row);
         }
     }
     table
 }
 
-fn percent(share: f64) -> String {
+fn more_or_less(share: f64) -> String {
     format!("{:+.1} %", 100.0 * share)
 }
 
@@ -115,9 +117,9 @@ fn models(found: &[Found]) -> Table {
         [
             "program",
             "part",
-            "overhead, ms",
-            "work, core ms",
-            "parallel, cores",
+            "overhead (ms)",
+            "work (core ms)",
+            "parallel (cores)",
         ],
     );
     for one in found {
@@ -140,7 +142,7 @@ fn models(found: &[Found]) -> Table {
 
 fn predictions(found: &[Found]) -> Table {
     let mut table = Table::new(
-        "Predicted, not measured: mean response times with more cores (milliseconds), and how many times as fast as natively on the class Pi",
+        "Predicted, not measured: mean response times with more cores (milliseconds), and how many times as fast as natively on the class Pi, by means",
         [
             "program",
             "cores",
@@ -179,23 +181,8 @@ fn predictions(found: &[Found]) -> Table {
 fn findings(section: &mut Section, one: &Found) {
     let (name, subject) = (one.name(), &one.study.subject);
     let Some(model) = &one.model else { return };
-    let pairs = one.held_back();
-    let relative: Vec<(f64, f64)> = pairs
-        .iter()
-        .map(|(predicted, measured)| (predicted / measured, 1.0))
-        .collect();
-    if let Some(error) = root_mean_square_error(&relative) {
-        let worst = relative.iter().map(|pair| (pair.0 - 1.0).abs());
-        section.findings.push(format!(
-            "{name}: at {} the model's error is {:.1} % (root mean square), at most {:.1} %.",
-            match pairs.len() {
-                1 => "the limit that was held back".to_owned(),
-                many => format!("the {many} limits that were held back"),
-            },
-            100.0 * error,
-            100.0 * worst.fold(0.0, f64::max)
-        ));
-    }
+    section.findings.extend(inside(one));
+    section.findings.extend(beyond(one, model));
     let computation = |cores: f64| {
         let of = one.points.iter().find(|point| point.0 == cores);
         of.map(|point| point.1[1])
@@ -230,6 +217,47 @@ fn findings(section: &mut Section, one: &Found) {
     ));
 }
 
+/// The model's error between the limits that it was fitted to.
+fn inside(one: &Found) -> Option<String> {
+    let pairs = one.pairs(Use::Inside, Model::cautious);
+    let relative: Vec<(f64, f64)> = pairs
+        .iter()
+        .map(|(predicted, measured)| (predicted / measured, 1.0))
+        .collect();
+    let error = root_mean_square_error(&relative)?;
+    let worst = relative.iter().map(|pair| (pair.0 - 1.0).abs());
+    let limits = match pairs.len() {
+        1 => "the limit that was held back".to_owned(),
+        many => format!("the {many} limits that were held back"),
+    };
+    Some(format!(
+        "{}: at {limits} inside the fitted range the model's error is {} (root mean square), at most {}.",
+        one.name(),
+        percent(Some(error)),
+        percent(Some(worst.fold(0.0, f64::max)))
+    ))
+}
+
+/// The errors of both predictions at the limit beyond those that the model was fitted to.
+fn beyond(one: &Found, model: &Model) -> Option<String> {
+    let cores = one.points.iter().find(|point| point.2 == Use::Beyond)?.0;
+    let error = |predict: fn(&Model, f64) -> f64| {
+        let (predicted, measured) = *one.pairs(Use::Beyond, predict).first()?;
+        Some(more_or_less(predicted / measured - 1.0))
+    };
+    let bound = (model.threads > 1).then(|| error(Model::bound)).flatten();
+    Some(format!(
+        "{}: beyond the fitted range, at {} cores where it goes to {}, the cautious prediction's error is {}{}.",
+        one.name(),
+        digits(cores),
+        digits(model.most),
+        error(Model::cautious)?,
+        bound
+            .map(|bound| format!(", that of the bound {bound}"))
+            .unwrap_or_default()
+    ))
+}
+
 /// What the points say of how many cores the program can use.
 fn ends(model: &Model) -> String {
     let end = digits(model.parts[1].parallel);
@@ -245,12 +273,17 @@ fn ends(model: &Model) -> String {
 }
 
 fn missing(section: &mut Section, one: &Found) {
-    let again = "run make eval again: what was measured stays";
     let mut lacks = |what: String, why: &str| {
-        section.missing.push(Missing::new(what, why, again));
+        section.missing.push(Missing::again(what, why));
     };
-    if let Measured::Missing(why) = &one.study.native {
-        lacks(format!("{}, native", one.name()), why);
+    let native = format!("{}, native", one.name());
+    match &one.study.native {
+        Measured::Missing(why) => lacks(native, why),
+        Measured::Done(trace) => {
+            if let Some(why) = &trace.node_ended {
+                lacks(format!("{native}: to its end"), why);
+            }
+        }
     }
     for (cores, measured) in &one.study.runs {
         let what = format!("{}, {cores} cores", one.name());
@@ -259,7 +292,11 @@ fn missing(section: &mut Section, one: &Found) {
             Measured::Done(run) if parts(&run.trace).is_none() => {
                 lacks(what, "the package told no parts of its time");
             }
-            Measured::Done(_) => {}
+            Measured::Done(run) => {
+                if let Some(why) = &run.trace.node_ended {
+                    lacks(format!("{what}: to its end"), why);
+                }
+            }
         }
     }
     if one.model.is_none() {
@@ -317,14 +354,22 @@ mod tests {
         let section = section(&[study(SUBJECTS[2], 8.0)]).expect("it is drawn");
         assert!(section.missing.is_empty(), "{:?}", section.missing);
         assert!(
-            section.findings[0].contains("3 limits that were held back the model's error is 0.0 %"),
+            section.findings[0].contains(
+                "3 limits that were held back inside the fitted range the model's error is 0.0 %"
+            ),
             "{:?}",
             section.findings
         );
-        assert!(section.findings[1].contains("1.75 times as fast with 2 threads"));
+        // 50 + 100 / 1.5 ms are predicted, 50 + 100 / 1.75 ms were measured.
+        assert!(
+            section.findings[1].contains("error is +8.9 %, that of the bound +0.0 %"),
+            "{:?}",
+            section.findings
+        );
+        assert!(section.findings[2].contains("1.50 times as fast with 2 threads"));
         let four = &section.tables[2].rows[0];
-        // 450 ms by 50 + 100 / 1.75, and by 50 + 100 / 4.
-        assert_eq!(four[1..], ["4", "450", "107", "4.2", "75.0", "6.0", "25.0"]);
+        // 450 ms by 50 + 100 / 1.5, and by 50 + 100 / 4.
+        assert_eq!(four[1..], ["4", "450", "117", "3.9", "75.0", "6.0", "25.0"]);
         let last = section.tables[2].rows.last().expect("rows");
         assert_eq!(last[5..], ["50.0", "9.0", "25.0"]);
         assert_eq!(section.figures.len(), 2);
@@ -334,7 +379,7 @@ mod tests {
     fn a_program_of_one_thread_gains_nothing() {
         let section = section(&[study(SUBJECTS[1], 1.0)]).expect("it is drawn");
         assert!(
-            section.findings[1].contains("more than 1.00 cores are not expected"),
+            section.findings[2].contains("more than 1.00 cores are not expected"),
             "{:?}",
             section.findings
         );

@@ -4,11 +4,13 @@ use anyhow::Result;
 
 use super::{CLASS, HERTZ, Q, Run, Runs, SetUp, TIMES, is_late, late, satisfaction};
 use crate::cells::Measured;
+use crate::place::Network;
 use crate::plots::{self, Banded, Series};
+use crate::recording::PICTURE;
 use crate::section::{Missing, Section, Table};
 use crate::statistics::{mean, quantile};
 use crate::trace::Request;
-use crate::words::{digits, milliseconds};
+use crate::words::{digits, known, milliseconds, percent};
 
 /// Of points.
 const CLASSES: [&str; 4] = [
@@ -31,11 +33,11 @@ pub fn section(runs: &Runs) -> Result<Section> {
     let mut table = table();
     for run in &runs.runs {
         match &run.measured {
-            Measured::Missing(why) => section.missing.push(Missing::new(
-                run.set_up.name(),
-                why.clone(),
-                "run make eval again: what was measured stays",
-            )),
+            Measured::Missing(why) => {
+                section
+                    .missing
+                    .push(Missing::again(run.set_up.name(), why.clone()));
+            }
             Measured::Done((trace, _)) => {
                 if let Some(why) = &trace.node_ended {
                     let what = format!("{}: to its end", run.set_up.name());
@@ -54,7 +56,7 @@ pub fn section(runs: &Runs) -> Result<Section> {
                         run.set_up.name(),
                         whose_q(run.set_up)
                     ),
-                    plots::timeline(&title, "request", "response time, s", &drawn(runs, run))?,
+                    plots::timeline(&title, "request", "response time (s)", &drawn(runs, run))?,
                 );
             }
         }
@@ -79,16 +81,38 @@ fn differs(runs: &Runs) -> Vec<String> {
         .iter()
         .map(|(from, to)| format!("{from}-{to}"))
         .collect();
+    let alone = done(runs).find(|(set_up, _)| *set_up == SetUp::Local);
+    let alone = alone.and_then(|(_, requests)| {
+        quantile(
+            &requests
+                .iter()
+                .filter_map(|one| one.response)
+                .collect::<Vec<f64>>(),
+            0.5,
+        )
+    });
+    let alone = alone.map(|median| {
+        format!(
+            ", where alone it needs {} ms of the {} ms from request to request (median)",
+            milliseconds(Some(median)),
+            milliseconds(Some(1.0 / HERTZ))
+        )
+    });
     vec![
         format!(
-            "object_detector stands in for SSD; it is asked {HERTZ} times a second, {} times, on a robot of the class {} ({} of a core), where it needs half of that time itself.",
+            "object_detector stands in for SSD; it is asked {HERTZ} times a second, {} times, on a robot of the class {} ({} of a core){}.",
             runs.course.requests,
             CLASS.name(),
-            CLASS.cores
+            CLASS.cores,
+            alone.unwrap_or_default()
         ),
         format!(
-            "The good network is the LAN (1 ms, 100 Mbit/s), the bad one, during requests {}, carries 2 Mbit/s with 100 ms and 1 % loss each way: one picture takes over a second.",
-            bad.join(", ")
+            "The good network is the LAN ({}). That during requests {} is bad ({}): one picture of {} bytes, as it is without a codec, takes {} s there at that rate.",
+            Network::Lan.told(),
+            bad.join(", "),
+            Network::Bad.told(),
+            PICTURE,
+            digits(Network::Bad.takes(PICTURE))
         ),
         format!(
             "T_desire is {} s, T_max {} s, Q begins at {}, Q_t is {}; Q stays below {} here, so that two late requests in a row always suffice (the published algorithm has no cap).",
@@ -108,8 +132,8 @@ fn table() -> Table {
             "never answered",
             "answered more than once",
             "answered first by the local original",
-            "mean response, ms",
-            "median, ms",
+            "mean response of those answered (ms)",
+            "median of those answered (ms)",
             "mean Q of the robot",
             "least Q of the robot",
             "mean Q of the cloud",
@@ -136,7 +160,7 @@ fn row(table: &mut Table, runs: &Runs, set_up: SetUp, requests: &[Request]) {
     let count = |is: &dyn Fn(&Request) -> bool| requests.iter().filter(|one| is(one)).count();
     let seen = satisfaction(requests);
     let own: Vec<f64> = requests.iter().filter_map(|one| one.satisfaction).collect();
-    let number = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), digits);
+    let number = |value: Option<f64>| known(value, digits);
     let onsets: Vec<String> = late(&runs.course, requests)
         .iter()
         .map(usize::to_string)
@@ -155,10 +179,6 @@ fn row(table: &mut Table, runs: &Runs, set_up: SetUp, requests: &[Request]) {
         number(seen.iter().copied().reduce(f64::min)),
         number(mean(&own)),
     ]);
-}
-
-fn percent(share: Option<f64>) -> String {
-    share.map_or_else(|| "–".to_owned(), |share| format!("{:.1} %", 100.0 * share))
 }
 
 /// The share that is answered within T_max.
@@ -245,7 +265,7 @@ fn findings(runs: &Runs) -> Vec<String> {
         if let Some((stub, local)) = within(stub).zip(within(local)) {
             if stub < local {
                 findings.push(format!(
-                    "Beside the original alone {:.1} % of the requests are late: those by which the stub notices that the network is bad, and those that the original answers late because stub and original share {} of a core.",
+                    "Compared with the original alone {:.1} percentage points more of the requests are late: those by which the stub notices that the network is bad, and those that the original answers late because stub and original share {} of a core.",
                     100.0 * (local - stub),
                     CLASS.cores
                 ));
@@ -330,7 +350,10 @@ mod tests {
         .expect("a section");
         let told = section.findings.join(" ");
         assert!(told.contains("did not help"), "{told}");
-        assert!(told.contains("25.0 % of the requests are late"), "{told}");
+        assert!(
+            told.contains("25.0 percentage points more of the requests"),
+            "{told}"
+        );
         assert!(section.missing.is_empty(), "{:?}", section.missing);
     }
 

@@ -2,6 +2,8 @@
 
 mod model;
 
+use std::collections::BTreeMap;
+
 use anyhow::Result;
 
 use super::{Plan, Point, Runs, THINK};
@@ -10,7 +12,7 @@ use crate::experiments::crowd::SHORT;
 use crate::plots::{self, Series};
 use crate::section::{Missing, Section, Table};
 use crate::statistics::{Node, Observed, mean, median, quantile};
-use crate::words::{digits, milliseconds, ratio};
+use crate::words::{digits, known, milliseconds, ratio};
 
 /// How many times as long as alone the median is where the curve counts as bent.
 const BENT: f64 = 2.0;
@@ -115,12 +117,19 @@ pub fn section(runs: &Runs) -> Result<Section> {
     Ok(section)
 }
 
+/// The start of each robot's servant, by the robot's number. Where an evaluation was cut off, all robots came anew after it: of those that
+/// were started twice, the first start counts.
+fn first_starts(told: &[Told]) -> BTreeMap<usize, f64> {
+    let mut all = BTreeMap::new();
+    for (number, time) in told.iter().flat_map(|one| &one.point.starts) {
+        all.entry(*number).or_insert(*time);
+    }
+    all
+}
+
 fn starts(told: &[Told], section: &mut Section) -> Result<()> {
-    let all: Vec<(usize, f64)> = told
-        .iter()
-        .flat_map(|one| one.point.starts.iter().copied())
-        .collect();
-    let times: Vec<f64> = all.iter().map(|start| start.1).collect();
+    let all = first_starts(told);
+    let times: Vec<f64> = all.values().copied().collect();
     let mut table = Table::new(
         "Start of a servant, until it has answered a first call (s)",
         ["figure", "published", "here", "servants started"],
@@ -132,7 +141,7 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
         table.push([
             name.to_owned(),
             "over 5".to_owned(),
-            value.map_or_else(|| "–".to_owned(), digits),
+            known(value, digits),
             times.len().to_string(),
         ]);
     }
@@ -190,7 +199,7 @@ fn points(told: &[Told], node: Option<&Node>, section: &mut Section) {
             milliseconds(quantile(&one.point.times, 0.95)),
             milliseconds(one.mean()),
             milliseconds(predicted),
-            error.map_or_else(|| "–".to_owned(), |error| format!("{:+.1}", error * 100.0)),
+            known(error, |error| format!("{:+.1}", error * 100.0)),
             format!("{:.0}", one.busy() * 100.0),
         ]);
     }

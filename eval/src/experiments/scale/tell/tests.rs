@@ -137,3 +137,22 @@ fn what_is_missing_is_named_and_the_rest_is_told() {
     assert_eq!(whats, ["4 robots", "the queueing model"]);
     assert_eq!(section.tables[0].rows[0][1..3], ["over 5", "0.30"]);
 }
+
+/// As after an evaluation that was cut off behind the first two points.
+#[test]
+fn a_robot_that_came_anew_is_counted_once() {
+    let mut runs = Runs([1, 2, 4].map(measured).into());
+    for (at, (_, measured)) in runs.0.iter_mut().enumerate() {
+        let Measured::Done(point) = measured else {
+            continue;
+        };
+        point.starts = match at {
+            0 => vec![(1, 0.1)],
+            1 => vec![(2, 0.2)],
+            _ => [1, 2, 3, 4].map(|number| (number, 0.5)).to_vec(),
+        };
+    }
+    let section = section(&runs).expect("it is told");
+    assert_eq!(section.tables[0].rows[0][2..], ["0.35", "4"]);
+    assert_eq!(section.tables[0].rows[1][2], "0.50");
+}
