@@ -34,6 +34,8 @@ pub enum Read {
 const PING: Duration = Duration::from_secs(30);
 /// A viewer of which nothing was heard for so long, not even a pong, is gone; so is one that takes nothing for so long.
 const SILENT: Duration = Duration::from_secs(90);
+/// Bytes that wait for the viewer; while there are more, it is given nothing.
+const AHEAD: usize = 1 << 20;
 /// For the last frames.
 const GOODBYE: Duration = Duration::from_secs(2);
 
@@ -44,6 +46,8 @@ pub struct Line<S> {
     heard: Instant,
     pinged: Instant,
     queued: usize,
+    /// Bytes of what it caused itself, since nothing waited for it.
+    answers: usize,
     /// When the socket last took something, or nothing had to be taken.
     took: Instant,
     timer: Pin<Box<Sleep>>,
@@ -59,14 +63,30 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
             heard: now,
             pinged: now,
             queued: 0,
+            answers: 0,
             took: now,
             timer: Box::pin(tokio::time::sleep_until(now)),
         }
     }
 
-    /// Bytes that wait for the viewer to take them.
-    pub fn queued(&self) -> usize {
-        self.socket.queued()
+    /// Whether it is given more of what flows in the servant.
+    pub fn is_given(&self) -> bool {
+        self.socket.queued() < AHEAD
+    }
+
+    /// Whether it is read from: until answers pile up, also while it takes nothing. A viewer that takes nothing before all that it
+    /// sends is taken, and is sent a big message meanwhile, would wait for ever.
+    pub fn is_read(&self) -> bool {
+        self.is_given() || self.answers < AHEAD
+    }
+
+    /// Sends a frame that the viewer caused, such as an answer or a complaint.
+    pub fn answer(&mut self, frame: Frame) {
+        self.answers += match &frame {
+            Frame::Text(text) => text.len(),
+            Frame::Binary(bytes) => bytes.len(),
+        };
+        self.send(frame);
     }
 
     /// Sends a frame, as far as [`next`](Self::next) is waited for.
@@ -95,6 +115,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
                 self.took = now;
             }
             self.queued = queued;
+            if queued == 0 {
+                self.answers = 0;
+            }
             if queued < before {
                 return Poll::Ready(None);
             }
@@ -109,6 +132,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
                     }
                     Poll::Ready(Ok(Message::Close(..))) => return Poll::Ready(Some(Read::Left)),
                     Poll::Ready(Ok(Message::Ping(payload))) => {
+                        self.answers += payload.len() + frame::MAX_CONTROL;
                         self.socket.queue(frame::PONG, payload);
                         pongs = true;
                     }
@@ -162,5 +186,58 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
     pub async fn answer_goodbye(mut self) {
         self.socket.queue_close(1000, "");
         let _ = timeout(GOODBYE, poll_fn(|cx| self.socket.poll_flush(cx))).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::AsyncWriteExt;
+
+    use super::*;
+
+    const BIG: usize = 2 << 20;
+
+    /// A masked binary message of a client, with a mask of nothing.
+    fn message() -> Vec<u8> {
+        let mut bytes = vec![0x82, 0x80 | 127];
+        bytes.extend_from_slice(&(BIG as u64).to_be_bytes());
+        bytes.extend_from_slice(&[0; 4]);
+        bytes.resize(bytes.len() + BIG, 7);
+        bytes
+    }
+
+    #[tokio::test]
+    async fn a_viewer_that_writes_before_it_reads_is_read() {
+        let (ours, mut theirs) = tokio::io::duplex(4096);
+        let mut line = Line::new(WebSocket::new(ours, b"", 2 * BIG, 2 * BIG));
+        line.send(Frame::Binary(vec![1; BIG].into()));
+        assert!(!line.is_given(), "it has enough");
+        let viewer = tokio::spawn(async move {
+            theirs.write_all(&message()).await.expect("taken");
+            // Nothing is read before.
+            theirs
+        });
+        let read = async {
+            loop {
+                if let Some(read) = line.next(line.is_read()).await {
+                    return read;
+                }
+            }
+        };
+        let read = timeout(Duration::from_secs(20), read).await;
+        let Ok(Read::Message(false, bytes)) = read else {
+            panic!("it is not read while it takes nothing");
+        };
+        assert_eq!(bytes.len(), BIG);
+        drop(viewer.await.expect("it has written all"));
+    }
+
+    #[tokio::test]
+    async fn a_viewer_whose_answers_pile_up_is_not_read() {
+        let (ours, _theirs) = tokio::io::duplex(64);
+        let mut line = Line::new(WebSocket::new(ours, b"", BIG, BIG));
+        assert!(line.is_read() && line.is_given());
+        line.answer(Frame::Text("x".repeat(BIG)));
+        assert!(!line.is_read() && !line.is_given());
     }
 }

@@ -60,8 +60,6 @@ const ADVERTISEMENTS: usize = 512;
 const CALLS: usize = 32;
 /// Bytes of a message from a viewer.
 const LARGEST: usize = 16 << 20;
-/// Bytes that wait for the viewer; while there are more, it is neither asked nor given anything.
-const AHEAD: usize = 1 << 20;
 /// Close codes (RFC 6455): of a servant that ends, and of what is not allowed any more.
 const ENDED: u16 = 1012;
 const NOT_ALLOWED: u16 = 1008;
@@ -138,11 +136,11 @@ pub async fn serve<S>(
     };
     session.greet(&options.name);
     let end = loop {
-        session.told.drain(..).for_each(|frame| line.send(frame));
-        // Who does not read is asked nothing more, and given nothing more.
-        let takes = line.queued() < AHEAD;
+        session.told.drain(..).for_each(|frame| line.answer(frame));
+        // Who does not read is given nothing more; and asked nothing more, once that makes more answers.
+        let (is_read, is_given) = (line.is_read(), line.is_given());
         tokio::select! {
-            read = line.next(takes) => match read {
+            read = line.next(is_read) => match read {
                 None => {}
                 Some(Read::Message(is_text, message)) => session.take(is_text, &message).await,
                 Some(Read::Left) => break End::Left,
@@ -151,7 +149,7 @@ pub async fn serve<S>(
                     break End::Close(code, reason, readable);
                 }
             },
-            Some(frame) = outgoing.recv(), if takes => line.send(frame),
+            Some(frame) = outgoing.recv(), if is_given => line.send(frame),
             reason = end(&mut ended) => break End::Close(ENDED, reason, true),
             changed = graph.changed() => {
                 if changed.is_err() {
