@@ -11,6 +11,7 @@ use bytes::Bytes;
 use crate::bus::WireType;
 
 const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
+const OLDER: &[u8] = b"#ROSBAG V1";
 const MESSAGE: u8 = 0x02;
 const CHUNK: u8 = 0x05;
 const CONNECTION: u8 = 0x07;
@@ -18,9 +19,15 @@ const CONNECTION: u8 = 0x07;
 /// Why a recording cannot be read. Positions are bytes from its beginning.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BagError {
-    /// Another version, or no bag at all.
+    /// Nothing is in it.
+    #[error("the file is empty")]
+    Empty,
+    /// Another kind of file.
+    #[error("this is no rosbag file; one is recorded with: rosbag record TOPIC")]
+    Other,
+    /// An older version.
     #[error(
-        "this is no rosbag file of version 2.0; older ones are brought up to date by: rosbag fix"
+        "this is a rosbag file of an older version than 2.0; it is brought up to date by: rosbag fix"
     )]
     Version,
     /// It ends in the middle, or a length in it is wrong.
@@ -47,7 +54,11 @@ pub struct Recorded {
 /// At most the first `limit` messages of a recording, in the order of the file.
 pub fn read(file: &Bytes, limit: usize) -> Result<Vec<Recorded>, BagError> {
     if !file.starts_with(MAGIC) {
-        return Err(BagError::Version);
+        return Err(match &file[..] {
+            [] => BagError::Empty,
+            older if older.starts_with(OLDER) => BagError::Version,
+            _ => BagError::Other,
+        });
     }
     let mut reader = Reader {
         connections: HashMap::new(),
@@ -236,10 +247,15 @@ mod tests {
 
     #[test]
     fn what_cannot_be_read_is_told() {
-        assert_eq!(
-            read(&Bytes::from_static(b"#ROSBAG V1.2\n"), 1).err(),
-            Some(BagError::Version)
-        );
+        for (file, why) in [
+            (&b"#ROSBAG V1.2\n"[..], BagError::Version),
+            (b"", BagError::Empty),
+            (b"RIFF\0\0\0\0AVI ", BagError::Other),
+        ] {
+            assert_eq!(read(&Bytes::from_static(file), 1).err(), Some(why));
+        }
+        let text = BagError::Other.to_string();
+        assert!(!text.contains("rosbag fix"), "{text}");
         let compressed = read(&Bytes::from(bag("bz2")), 1).expect_err("compressed");
         assert!(
             compressed.to_string().contains("rosbag decompress"),

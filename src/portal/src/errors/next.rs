@@ -214,6 +214,10 @@ fn next_of_choreographer(error: &choreographer::Error) -> String {
         C::Place { service, .. } => format!(
             "name one of the servants of {service}, which are named ~group- where a robot's name stands: cloudroidctl servants"
         ),
+        // Nothing is wrong with what somebody has ended.
+        C::Servant { reason, .. } if reason.starts_with("was ended: ") => {
+            "begin again; who ended it is told by: cloudroidctl events".into()
+        }
         C::Servant { service, .. } => {
             format!("see cloudroidctl events, and push {service} again when its package is fixed")
         }
@@ -246,7 +250,9 @@ fn next_of_reach(error: &reach::Error) -> &'static str {
             "see what became of the servant with: cloudroidctl events, then try again"
         }
         R::Linked(_) => "try the service with a robot that has its stub",
-        R::Trial(_) => "give a recording (rosbag 2.0) or a PNG file of what the service listens to",
+        R::Trial(_) => {
+            "give a recording (rosbag 2.0) of what the service listens to; try and calibrate take PNG files as well"
+        }
     }
 }
 

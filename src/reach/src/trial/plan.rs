@@ -143,8 +143,9 @@ impl<'a> Plan<'a> {
                     return Err(nothing(&match plan.unused.is_empty() {
                         true => "the recording holds no message".to_owned(),
                         false => format!(
-                            "no topic of the recording is an input of the service (it has {})",
-                            plan.unused.join(", ")
+                            "no topic of the recording is an input of the service (it has {}){}",
+                            plan.unused.join(", "),
+                            of_another_type(&inputs, recorded)
                         ),
                     }));
                 }
@@ -246,6 +247,19 @@ fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
     Ok(WireType::of(&known))
 }
 
+/// Recorded topics that have the name of an input and another type.
+fn of_another_type(inputs: &[&Topic], recorded: &[Recorded]) -> String {
+    let there = inputs.iter().filter_map(|input| {
+        let mut recorded = recorded.iter();
+        let of_name = recorded.find(|message| *message.topic == *input.name)?;
+        Some(format!(
+            "; {} is {} there",
+            input.name, of_name.wire_type.name
+        ))
+    });
+    there.collect()
+}
+
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
@@ -319,6 +333,11 @@ mod tests {
         let text = refused(recorded("/tf", "tf2_msgs/TFMessage", "x"), None);
         assert!(
             text.contains("it has /tf); its inputs are: /name (std_msgs/String)"),
+            "{text}"
+        );
+        let text = refused(recorded("/name", "std_msgs/Int8", "x"), None);
+        assert!(
+            text.contains("(it has /name); /name is std_msgs/Int8 there; its inputs are: /name"),
             "{text}"
         );
         let text = refused(recorded("/name", "std_msgs/String", "other"), None);

@@ -310,3 +310,18 @@ fn want_of_memory_is_mended_where_the_memory_was_named() {
         assert!(next.contains(option), "{next}");
     }
 }
+
+#[test]
+fn nobody_is_to_mend_a_package_whose_servant_somebody_has_ended() {
+    let next = |reason: &str| {
+        let error = choreographer::Error::Servant {
+            service: "people".into(),
+            robot: "r1".into(),
+            reason: reason.into(),
+            log: Vec::new(),
+        };
+        Error::from(error).problem().next.unwrap_or_default()
+    };
+    assert!(!next("was ended: an operator has stopped it").contains("package"));
+    assert!(next("exited with status 1").contains("push people again"));
+}
