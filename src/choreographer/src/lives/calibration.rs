@@ -1,6 +1,7 @@
 //! Measures a service at several limits: one servant, which serves no robot, is given the same requests at each.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use api::Size;
@@ -30,6 +31,8 @@ const IN_VAIN: usize = 3;
 const CORES: f64 = 1.0;
 /// Thousandths of a core below which no servant is limited.
 const LEAST: u64 = 10;
+/// How long the end of its servant is waited for.
+const ENDS: Duration = Duration::from_secs(10);
 /// How often its memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -70,10 +73,6 @@ impl Choreographer {
         options: &CalibrationOptions,
         events: &mpsc::Sender<CalibrationEvent>,
     ) -> Result<Calibration, Error> {
-        let step = async |title: String| {
-            // Whoever asked has gone: then this is dropped soon.
-            let _ = events.send(CalibrationEvent::Step { title }).await;
-        };
         let revision = self.inner.catalogue.current(service)?;
         reach::fits(
             service,
@@ -86,7 +85,36 @@ impl Choreographer {
             memory: options.memory,
             ..api::Limits::default()
         };
+        // Whoever names limits hears of one that is never possible before anything is started.
+        if let Some(least) = options.cpus.iter().copied().min_by(f64::total_cmp) {
+            self.check_limits(&api::Limits {
+                cpus: Some(least),
+                ..set
+            })?;
+        }
         let measured = self.measured(service, PURPOSE, set)?;
+        let found = self
+            .measures(&measured, service, requests, options, events)
+            .await;
+        // What is measured next finds the room that this had.
+        let handle = Arc::clone(measured.lease.handle());
+        drop(measured);
+        let _ = timeout(ENDS, handle.ended()).await;
+        found
+    }
+
+    async fn measures(
+        &self,
+        measured: &Measured,
+        service: &str,
+        requests: Requests,
+        options: &CalibrationOptions,
+        events: &mpsc::Sender<CalibrationEvent>,
+    ) -> Result<Calibration, Error> {
+        let step = async |title: String| {
+            // Whoever asked has gone: then this is dropped soon.
+            let _ = events.send(CalibrationEvent::Step { title }).await;
+        };
         let gave_way = |error| match measured.lease.handle() {
             handle if handle.gave_way() => Error::Calibration(format!(
                 "measuring {service} was given up before it came to anything: {GAVE_WAY}; calibrate on a machine with more room, \
@@ -97,10 +125,10 @@ impl Choreographer {
         step(format!("starting a servant of {service} to measure")).await;
         measured.lease.admitted().await.map_err(gave_way)?;
         let reach = measured.lease.ready().await.map_err(gave_way)?;
-        let ladder = self.limits_for(&measured, options)?;
+        let ladder = self.limits_for(measured, options)?;
         let mut measuring = Measuring {
             choreographer: self,
-            measured: &measured,
+            measured,
             reach: &*reach,
             pace: pace(options),
             own: options.own,
