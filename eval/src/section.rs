@@ -124,7 +124,7 @@ pub enum Image {
 }
 
 /// What helps where a run failed.
-const AGAIN: &str = "run make eval again: what was measured stays";
+pub const AGAIN: &str = "run make eval again: what was measured stays";
 
 /// Something that was to be measured and was not.
 #[derive(Debug, Clone, Serialize, Deserialize)]

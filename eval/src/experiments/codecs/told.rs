@@ -7,7 +7,7 @@ use super::{CLASS, HURRY, Kind, Runs, Sent, Setting, What, title};
 use crate::cells::Measured;
 use crate::place::Network;
 use crate::plots::{self, Bar};
-use crate::section::{Missing, Section, Table};
+use crate::section::{AGAIN, Missing, Section, Table};
 use crate::statistics::quantile;
 use crate::words::{self, known, milliseconds};
 
@@ -279,13 +279,12 @@ fn bar(kind: Kind, name: &str, value: f64) -> Bar {
 }
 
 fn missing(section: &mut Section, runs: &Runs) {
-    let again = "run make eval again: what was measured stays";
     let mut add = |what: String, why: &str, next: &str| {
         section.missing.push(Missing::new(what, why, next));
     };
     for (what, sent) in &runs.streams {
         match sent {
-            Measured::Missing(why) => add(title(what), why, again),
+            Measured::Missing(why) => add(title(what), why, AGAIN),
             Measured::Done(Sent {
                 warning: Some(why), ..
             }) => add(
@@ -296,19 +295,19 @@ fn missing(section: &mut Section, runs: &Runs) {
             Measured::Done(sent) if sent.carried.is_none() => add(
                 format!("{}: bytes on the cable", title(what)),
                 "the robot has no counters of its network, or nothing was answered",
-                again,
+                AGAIN,
             ),
             Measured::Done(_) => {}
         }
     }
     for (what, received) in &runs.received {
         if let Measured::Missing(why) = received {
-            add(format!("{}: signal to noise", title(what)), why, again);
+            add(format!("{}: signal to noise", title(what)), why, AGAIN);
         }
     }
     for (kind, alone) in &runs.alone {
         if let Measured::Missing(why) = alone {
-            add(format!("{}: codecs alone", kind.name()), why, again);
+            add(format!("{}: codecs alone", kind.name()), why, AGAIN);
         }
     }
 }
