@@ -1,21 +1,27 @@
-//! Serialized ROS 1 messages ⇄ JSON and CBOR, in one pass from input bytes to output buffer.
+//! Serialized messages of either ROS ⇄ JSON and CBOR, in one pass from input bytes to output buffer.
 //!
 //! Each [`MessageType`] carries a plan compiled when it was resolved: the literals between values are already
 //! written out, nested messages are flattened, arrays of numbers move as blocks. No tree of values is built.
 //!
 //! ```text
-//! ROS bytes ── walk (plan, bounds) ──▶ Format: json_out │ cbor_out │ validate
-//! JSON, CBOR ─ Input: json_in │ cbor_in ──▶ fill (order, defaults, stamps) ──▶ ROS bytes
+//! ROS bytes ── Reader: ROS 1 │ CDR ── walk (plan) ──▶ Format: json_out │ cbor_out │ validate
+//! JSON, CBOR ─ Input: json_in │ cbor_in ──▶ fill (order, defaults, stamps) ── Layout: ROS 1 │ CDR ──▶ ROS bytes
 //! ```
 //!
-//! What the values look like is rosbridge's: bytes (`uint8[]`, `char[]`) are base64 in JSON and a byte string in
-//! CBOR, times are `{"secs", "nsecs"}`, other numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
+//! Which bytes a message has is a matter of its type ([`MessageType::version`]); a message of ROS 2 begins with the
+//! header of its serialization, may be of either order of bytes, and is written little endian.
+//!
+//! What the values look like is rosbridge's: bytes (`uint8[]`, `char[]`, ROS 2's `byte[]`) are base64 in JSON and a byte
+//! string in CBOR, times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (either is understood), other
+//! numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
 //!
 //! On an error the output buffer is left as it was.
 
 mod cbor_in;
 mod cbor_item;
 mod cbor_out;
+mod cdr;
+pub(crate) mod cursor;
 mod digits;
 mod fault;
 mod fill;
@@ -24,6 +30,8 @@ mod json_in;
 mod json_out;
 mod json_text;
 mod number;
+mod reader;
+mod realign;
 mod stamps;
 mod typed_array;
 mod value;
@@ -34,6 +42,7 @@ mod tests;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use crate::bus::RosVersion;
 use crate::schema::MessageType;
 
 pub use cbor_item::cbor_item_len;
@@ -139,7 +148,7 @@ impl Default for CborOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FillOptions {
     /// The current time: for `"now"` in place of a time, and for a `std_msgs/Header` that is missing from its
-    /// message or has no stamp. Without it both are zero.
+    /// message or has no stamp. Without it both are zero. (ROS 2 counts signed seconds: until 2038.)
     pub now: Option<Time>,
     /// Most bytes to write.
     pub max_bytes: usize,
@@ -207,15 +216,28 @@ pub fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), CodecError> {
     walk::validate(message, bytes).map_err(|fault| fault.of(message))
 }
 
-/// The default message: zeros, empty strings and arrays.
+/// The default message, serialized: zeros, empty strings and arrays, and what a ROS 2 definition says instead.
+pub fn default_message(message: &MessageType) -> Vec<u8> {
+    let mut out = Vec::new();
+    let unlimited = FillOptions {
+        now: None,
+        max_bytes: usize::MAX,
+    };
+    // An object without fields is a valid message of any type, so there is nothing to go wrong.
+    match from_json(message, b"{}", &mut out, &unlimited) {
+        Ok(()) => out,
+        Err(_) => Vec::new(),
+    }
+}
+
+/// The default message as JSON.
 pub fn default_json(message: &MessageType) -> String {
     let mut out = Vec::new();
     let unlimited = JsonOptions {
         max_bytes: usize::MAX,
         ..JsonOptions::default()
     };
-    // Zeros are a valid message of any type, so there is nothing to go wrong.
-    match to_json(message, &vec![0; message.min_size()], &mut out, &unlimited) {
+    match to_json(message, &default_message(message), &mut out, &unlimited) {
         Ok(()) => String::from_utf8(out).unwrap_or_default(),
         Err(_) => "{}".to_owned(),
     }
@@ -226,7 +248,15 @@ pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
     if !message.has_header() {
         return None;
     }
-    let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?));
+    // In ROS 2 the second byte says which order the others are in.
+    let big_endian = message.version() == RosVersion::Two && bytes.get(1) == Some(&0);
+    let word = |at: usize| {
+        let word = bytes.get(at..at + 4)?.try_into().ok()?;
+        Some(match big_endian {
+            true => u32::from_be_bytes(word),
+            false => u32::from_le_bytes(word),
+        })
+    };
     Some(Time {
         secs: word(4)?,
         nsecs: word(8)?,

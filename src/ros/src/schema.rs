@@ -1,10 +1,16 @@
 //! Definitions of messages, services and actions: `.msg`, `.srv` and `.action` texts in, [`MessageType`]s with
-//! resolved fields, MD5 and a compiled codec plan out.
+//! resolved fields, digest and a compiled codec plan out.
 //!
-//! The grammar, the MD5 and the full text are those of ROS 1's genmsg (<http://wiki.ros.org/msg>): both ends of a
-//! TCPROS connection compare the MD5, so it must agree to the bit.
+//! A [`Registry`] is of one version of ROS. ROS 1's grammar, MD5 and full text are those of genmsg
+//! (<http://wiki.ros.org/msg>), ROS 2's grammar and type hash those of rosidl (REP 2016): both ends of a connection
+//! compare the digest, so it must agree to the bit. What differs is one module each: the grammar (`parse` and
+//! `parse::ros2`), the messages that services and actions bring (`action` and `derived`), the digest (`resolve` and
+//! `description`). Names are `package/Type` in ROS 1 and `package/msg/Type` in ROS 2; either is understood.
 
 mod action;
+mod derived;
+mod description;
+pub(crate) mod initial;
 mod limits;
 mod parse;
 pub(crate) mod plan;
@@ -18,7 +24,10 @@ mod tests;
 
 pub use limits::{MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TEXT_BYTES};
 pub use registry::Registry;
-pub use types::{ActionDef, Arity, Base, Constant, Field, MessageType, Primitive, ServiceDef};
+pub use types::{
+    ActionDef, ActionServices, Arity, Base, Bounds, Constant, Field, MessageType, Primitive,
+    ServiceDef,
+};
 
 /// Why a definition cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+use crate::bus::RosVersion;
 use crate::schema::{MessageType, SchemaError, ServiceDef};
 
 /// How messages are written between the ends of a topic or service.
@@ -11,6 +12,26 @@ pub enum WireFormat {
     /// Little endian, unaligned, lengths of four bytes (<http://wiki.ros.org/ROS/Technical%20Overview>).
     #[default]
     Ros1,
+    /// ROS 2's: the header of a representation, and CDR.
+    Cdr,
+}
+
+impl WireFormat {
+    /// That of a version of ROS.
+    pub fn of(version: RosVersion) -> Self {
+        match version {
+            RosVersion::One => Self::Ros1,
+            RosVersion::Two => Self::Cdr,
+        }
+    }
+
+    /// Which ROS writes so.
+    pub fn version(self) -> RosVersion {
+        match self {
+            Self::Ros1 => RosVersion::One,
+            Self::Cdr => RosVersion::Two,
+        }
+    }
 }
 
 /// What tells definitions of one name apart: the MD5 of a ROS 1 type, 32 lower-case hex digits, or the type hash of a ROS 2
@@ -118,7 +139,10 @@ impl WireType {
 
     /// A type whose definition is known.
     pub fn of(message: &MessageType) -> Self {
-        Self::new(message.name(), message.md5(), message.full_text())
+        Self {
+            format: WireFormat::of(message.version()),
+            ..Self::new(message.name(), message.digest(), message.full_text())
+        }
     }
 
     /// A type of which only the name is known: any definition will do.
@@ -138,7 +162,7 @@ impl WireType {
 
     /// What its definition says.
     pub fn schema(&self) -> Result<Arc<MessageType>, SchemaError> {
-        MessageType::from_full_text(&self.name, &self.definition)
+        MessageType::of_full_text(self.format.version(), &self.name, &self.definition)
     }
 }
 
@@ -172,6 +196,9 @@ impl ServiceType {
 
     /// A type whose definition is known.
     pub fn of(service: &ServiceDef) -> Self {
-        Self::new(&*service.name, &*service.md5)
+        Self {
+            format: WireFormat::of(service.request.version()),
+            ..Self::new(&*service.name, &*service.md5)
+        }
     }
 }

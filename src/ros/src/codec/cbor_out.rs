@@ -42,19 +42,13 @@ impl Format for Cbor<'_> {
             Scalar::I8 | Scalar::I16 | Scalar::I32 | Scalar::I64 => self.integer(signed(bytes)),
             Scalar::F32 => self.float::<4, 5>(26, bytes),
             Scalar::F64 => self.float::<8, 9>(27, bytes),
-            Scalar::Time | Scalar::Duration => {
-                let (secs, nsecs) = bytes.split_at(4);
-                let part = if scalar == Scalar::Time {
-                    Scalar::U32
-                } else {
-                    Scalar::I32
-                };
-                head(self.out, MAP, 2);
-                self.out.extend_from_slice(b"\x64secs");
-                self.scalar(part, secs);
-                self.out.extend_from_slice(b"\x65nsecs");
-                self.scalar(part, nsecs);
-            }
+            Scalar::Time => self.time([b"\x64secs", b"\x65nsecs"], [Scalar::U32; 2], bytes),
+            Scalar::Duration => self.time([b"\x64secs", b"\x65nsecs"], [Scalar::I32; 2], bytes),
+            Scalar::Time2 | Scalar::Duration2 => self.time(
+                [b"\x63sec", b"\x67nanosec"],
+                [Scalar::I32, Scalar::U32],
+                bytes,
+            ),
         }
     }
 
@@ -112,6 +106,14 @@ impl Cbor<'_> {
             Ok(value) => head(self.out, UNSIGNED, value),
             // CBOR stores -1 - n, which is what all bits flipped gives.
             Err(_) => head(self.out, NEGATIVE, !value as u64),
+        }
+    }
+
+    fn time(&mut self, names: [&[u8]; 2], parts: [Scalar; 2], bytes: &[u8]) {
+        head(self.out, MAP, 2);
+        for (index, (name, part)) in names.into_iter().zip(parts).enumerate() {
+            self.out.extend_from_slice(name);
+            self.scalar(part, &bytes[4 * index..][..4]);
         }
     }
 

@@ -91,6 +91,24 @@ pub enum CodecErrorKind {
         /// As given; at least, where counting stopped there.
         found: usize,
     },
+    /// More elements, or characters, than the definition lets there be.
+    #[error("takes at most {most} {of}, got {found}")]
+    TooMany {
+        /// The bound of the definition.
+        most: usize,
+        /// What is counted.
+        of: &'static str,
+        /// As given; at least, where counting stopped there.
+        found: usize,
+    },
+    /// A way of serializing that ROS 2's nodes do not use.
+    #[error(
+        "serialized as representation {0:#06x}, of which only plain CDR is read (0x0000 and 0x0001)"
+    )]
+    Representation(
+        /// The first two bytes of the message (DDS-XTypes 1.3, table 60).
+        u16,
+    ),
     /// Bytes given as text that is not base64.
     #[error("the text is not base64")]
     Base64,

@@ -4,13 +4,18 @@
 //! definition's order, so values go straight to their place, with a default wherever a field was passed over. When
 //! one comes after all (or twice), it is appended, and the pieces are put in order at the object's end.
 
+mod layout;
+
 use std::sync::LazyLock;
 
+use crate::bus::RosVersion;
+use crate::codec::cdr;
 use crate::codec::fault::{CodecErrorKind, Fault};
+use crate::codec::fill::layout::{Aligned, Layout, Packed};
 use crate::codec::number::Wire;
 use crate::codec::{FillOptions, Time};
 use crate::schema::MessageType;
-use crate::schema::plan::{Count, Kind, Member, Members, Scalar};
+use crate::schema::plan::{Count, Kind, Member, Members, Scalar, Text};
 
 /// Where values come from.
 pub(crate) trait Input {
@@ -49,12 +54,30 @@ pub(crate) fn fill<I: Input>(
     out: &mut Vec<u8>,
     options: &FillOptions,
 ) -> Result<(), Fault> {
-    let limit = out.len().saturating_add(options.max_bytes);
+    let end = out.len().saturating_add(options.max_bytes);
+    match message.version() {
+        RosVersion::One => fill_body(input, message, out, options, (Packed, end)),
+        RosVersion::Two => {
+            out.extend_from_slice(&cdr::HEADER);
+            let layout = Aligned { origin: out.len() };
+            fill_body(input, message, out, options, (layout, end))
+        }
+    }
+}
+
+fn fill_body<I: Input, L: Layout>(
+    input: &mut I,
+    message: &MessageType,
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+    (layout, end): (L, usize),
+) -> Result<(), Fault> {
     let mut filler = Filler {
         input,
         out,
+        layout,
         options,
-        end: limit,
+        end,
         places: Vec::new(),
         scratch: Vec::new(),
     };
@@ -62,9 +85,10 @@ pub(crate) fn fill<I: Input>(
     filler.room(0)
 }
 
-struct Filler<'a, I> {
+struct Filler<'a, I, L> {
     input: &'a mut I,
     out: &'a mut Vec<u8>,
+    layout: L,
     options: &'a FillOptions,
     /// Where the output must have ended.
     end: usize,
@@ -73,7 +97,7 @@ struct Filler<'a, I> {
     scratch: Vec<u8>,
 }
 
-impl<I: Input> Filler<'_, I> {
+impl<I: Input, L: Layout> Filler<'_, I, L> {
     fn message(&mut self, message: &MessageType) -> Result<(), Fault> {
         let plan = &message.plan;
         let members = plan.members.list();
@@ -105,21 +129,26 @@ impl<I: Input> Filler<'_, I> {
             self.default_field(plan.header, missing)?;
         }
         if moved {
-            self.put_in_order(base, start);
+            self.put_in_order(plan.members.list(), base, start);
         }
         self.places.truncate(base);
+        if L::PLACEHOLDERS && plan.placeholder {
+            self.out.push(0);
+        }
         Ok(())
     }
 
     #[inline]
     fn field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
         match &member.kind {
-            Kind::Scalar(scalar @ (Scalar::Time | Scalar::Duration)) => {
+            Kind::Scalar(
+                scalar @ (Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2),
+            ) => {
                 let default = if in_header { self.options.now } else { None };
                 self.time(*scalar, default.unwrap_or_default())
             }
             Kind::Scalar(scalar) => self.scalar(*scalar),
-            Kind::Text => self.text(),
+            Kind::Text(text) => self.text(*text),
             Kind::Bytes(count) => {
                 let begin = self.begin_count(*count);
                 if self.input.bytes(self.out)? {
@@ -130,7 +159,7 @@ impl<I: Input> Filler<'_, I> {
                 self.end_count(*count, begin, found)
             }
             Kind::Scalars(scalar, count) => self.scalars(*scalar, *count),
-            Kind::Texts(count) => self.elements(*count, Self::text),
+            Kind::Texts(text, count) => self.elements(*count, |filler| filler.text(*text)),
             Kind::Struct(message) => self.message(message),
             Kind::Structs(message, count) => {
                 self.elements(*count, |filler| filler.message(message))
@@ -139,6 +168,7 @@ impl<I: Input> Filler<'_, I> {
     }
 
     fn scalar(&mut self, scalar: Scalar) -> Result<(), Fault> {
+        self.layout.align(self.out, scalar.alignment());
         match scalar {
             Scalar::Bool => self.out.push(self.input.boolean()?.into()),
             Scalar::I8 => self.input.number::<i8>()?.put(self.out),
@@ -151,12 +181,20 @@ impl<I: Input> Filler<'_, I> {
             Scalar::U64 => self.input.number::<u64>()?.put(self.out),
             Scalar::F32 => self.input.number::<f32>()?.put(self.out),
             Scalar::F64 => self.input.number::<f64>()?.put(self.out),
-            Scalar::Time | Scalar::Duration => self.time(scalar, Time::default())?,
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => {
+                self.time(scalar, Time::default())?;
+            }
         }
         Ok(())
     }
 
     fn scalars(&mut self, scalar: Scalar, count: Count) -> Result<(), Fault> {
+        if matches!(
+            scalar,
+            Scalar::Bool | Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2
+        ) {
+            return self.elements(count, |filler| filler.scalar(scalar));
+        }
         let begin = self.begin_count(count);
         let found = match scalar {
             Scalar::I8 => self.numbers::<i8>(count, "a list of int8"),
@@ -168,37 +206,40 @@ impl<I: Input> Filler<'_, I> {
             Scalar::I64 => self.numbers::<i64>(count, "a list of int64"),
             Scalar::U64 => self.numbers::<u64>(count, "a list of uint64"),
             Scalar::F32 => self.numbers::<f32>(count, "a list of float32"),
-            Scalar::F64 => self.numbers::<f64>(count, "a list of float64"),
-            Scalar::Bool | Scalar::Time | Scalar::Duration => {
-                self.out.truncate(begin - prefix_size(count));
-                return self.elements(count, |filler| filler.scalar(scalar));
-            }
+            // Of the others, those that are not numbers are written one by one.
+            _ => self.numbers::<f64>(count, "a list of float64"),
         }?;
         self.end_count(count, begin, found)
     }
 
     /// Appends numbers and gives how many there were.
     fn numbers<T: Wire>(&mut self, count: Count, expected: &'static str) -> Result<usize, Fault> {
+        let unaligned = self.out.len();
+        self.layout.align(self.out, T::SCALAR.alignment());
         let begin = self.out.len();
         if self.input.typed_array::<T>(self.out)? {
-            return Ok((self.out.len() - begin) / T::SCALAR.size());
+            let found = (self.out.len() - begin) / T::SCALAR.size();
+            if found == 0 {
+                self.out.truncate(unaligned);
+            }
+            return Ok(found);
         }
         let most = count.most();
         let mut array = self.input.begin_array(expected)?;
         let mut found = 0;
         while self.input.next_element(&mut array)? {
             if found == most {
-                return Err(CodecErrorKind::WrongLength {
-                    expected: most,
-                    found: found + 1,
-                }
-                .into());
+                return Err(too_many(count, found + 1));
             }
             self.input
                 .number::<T>()
                 .map_err(|fault| fault.at_index(found))?
                 .put(self.out);
             found += 1;
+        }
+        // No elements, no padding.
+        if found == 0 {
+            self.out.truncate(unaligned);
         }
         Ok(found)
     }
@@ -214,11 +255,7 @@ impl<I: Input> Filler<'_, I> {
         let mut found = 0;
         while self.input.next_element(&mut array)? {
             if found == most {
-                return Err(CodecErrorKind::WrongLength {
-                    expected: most,
-                    found: found + 1,
-                }
-                .into());
+                return Err(too_many(count, found + 1));
             }
             element(self)
                 .and_then(|()| self.room(0))
@@ -228,32 +265,48 @@ impl<I: Input> Filler<'_, I> {
         self.end_count(count, begin, found)
     }
 
-    fn text(&mut self) -> Result<(), Fault> {
+    fn text(&mut self, text: Text) -> Result<(), Fault> {
         let begin = self.begin_count(Count::Variable);
+        if text.wide {
+            let mut scratch = std::mem::take(&mut self.scratch);
+            scratch.clear();
+            self.input.text(&mut scratch)?;
+            let written = String::from_utf8_lossy(&scratch);
+            check_text(text, &written)?;
+            let units = layout::put_wide(self.out, &written);
+            self.scratch = scratch;
+            return self.end_count(Count::Variable, begin, units);
+        }
         self.input.text(self.out)?;
+        if text.most < usize::MAX {
+            check_text(text, &String::from_utf8_lossy(&self.out[begin..]))?;
+        }
+        if L::TERMINATED {
+            self.out.push(0);
+        }
         self.end_count(Count::Variable, begin, self.out.len() - begin)
     }
 
     /// `default` counts where the object leaves a part out.
     fn time(&mut self, scalar: Scalar, default: Time) -> Result<(), Fault> {
+        self.layout.align(self.out, scalar.alignment());
         let begin = self.out.len();
-        if scalar == Scalar::Time && self.input.now() {
+        let is_time = matches!(scalar, Scalar::Time | Scalar::Time2);
+        if is_time && self.input.now() {
             self.put_time(self.options.now.unwrap_or_default());
             return Ok(());
         }
-        self.put_time(if scalar == Scalar::Time {
-            default
-        } else {
-            Time::default()
-        });
+        self.put_time(if is_time { default } else { Time::default() });
         let mut object = self.input.begin_object()?;
         let mut expected = 0;
         while let Some(index) = self
             .input
             .next_member(&mut object, &TIME_MEMBERS, expected)?
         {
-            let part = match scalar {
-                Scalar::Time => self.input.number::<u32>(),
+            let part = match (scalar, index % 2) {
+                (Scalar::Time, _) | (Scalar::Time2 | Scalar::Duration2, 1) => {
+                    self.input.number::<u32>()
+                }
                 _ => self.input.number::<i32>().map(|part| part as u32),
             };
             let part = part.map_err(|fault| fault.in_field(&TIME_MEMBERS.list()[index].name))?;
@@ -273,35 +326,37 @@ impl<I: Input> Filler<'_, I> {
         let begin = self.out.len();
         self.room(member.min_size)
             .map_err(|fault| fault.in_field(&member.name))?;
-        self.out.resize(begin + member.min_size, 0);
-        let stamp = match &member.kind {
-            Kind::Scalar(Scalar::Time) if in_header => Some(begin),
-            Kind::Struct(message) if message.plan.header => Some(begin + 4),
-            _ => None,
-        };
-        if let (Some(at), Some(now)) = (stamp, self.options.now) {
-            self.out[at..at + 4].copy_from_slice(&now.secs.to_le_bytes());
-            self.out[at + 4..at + 8].copy_from_slice(&now.nsecs.to_le_bytes());
-        }
+        let stamped =
+            in_header || matches!(&member.kind, Kind::Struct(message) if message.plan.header);
+        let now = self.options.now.filter(|_| stamped);
+        self.layout.put_default(self.out, member, now);
+        self.room(0).map_err(|fault| fault.in_field(&member.name))?;
         self.places.push((begin, self.out.len()));
         Ok(())
     }
 
     /// Rewrites the object that began at `start` with its fields where they belong.
     #[cold]
-    fn put_in_order(&mut self, base: usize, start: usize) {
+    fn put_in_order(&mut self, members: &[Member], base: usize, start: usize) {
+        let phase = self.layout.phase(start);
         self.scratch.clear();
+        self.scratch.resize(phase, 0);
         self.scratch.extend_from_slice(&self.out[start..]);
         self.out.truncate(start);
-        for &(begin, end) in &self.places[base..] {
-            self.out
-                .extend_from_slice(&self.scratch[begin - start..end - start]);
+        let moved = |at: usize| phase + at - start;
+        for (member, &(begin, end)) in members.iter().zip(&self.places[base..]) {
+            let piece = moved(begin)..moved(end);
+            self.layout
+                .put_piece(self.out, member, &self.scratch, piece);
         }
     }
 
     /// Leaves room for a length; gives where the elements begin.
     fn begin_count(&mut self, count: Count) -> usize {
-        self.out.extend_from_slice(&[0; 4][..prefix_size(count)]);
+        if !matches!(count, Count::Fixed(_)) {
+            self.layout.align(self.out, 4);
+            self.out.extend_from_slice(&[0; 4]);
+        }
         self.out.len()
     }
 
@@ -313,7 +368,8 @@ impl<I: Input> Filler<'_, I> {
                 Err(CodecErrorKind::WrongLength { expected, found }.into())
             }
             Count::Fixed(_) => Ok(()),
-            Count::Variable => {
+            Count::Bounded(most) if found > most => Err(too_many(count, found)),
+            Count::Variable | Count::Bounded(_) => {
                 let length = u32::try_from(found)
                     .map_err(|_| CodecErrorKind::TooLarge(u32::MAX as usize))?;
                 self.out[begin - 4..begin].copy_from_slice(&length.to_le_bytes());
@@ -331,9 +387,33 @@ impl<I: Input> Filler<'_, I> {
     }
 }
 
-/// Bytes of the length that stands before an array.
-fn prefix_size(count: Count) -> usize {
-    if count == Count::Variable { 4 } else { 0 }
+/// More elements came than there may be.
+#[cold]
+fn too_many(count: Count, found: usize) -> Fault {
+    match count {
+        Count::Fixed(expected) => CodecErrorKind::WrongLength { expected, found },
+        _ => CodecErrorKind::TooMany {
+            most: count.most(),
+            of: "elements",
+            found,
+        },
+    }
+    .into()
+}
+
+fn check_text(text: Text, written: &str) -> Result<(), Fault> {
+    if text.most == usize::MAX {
+        return Ok(());
+    }
+    match written.chars().count() {
+        found if found > text.most => Err(CodecErrorKind::TooMany {
+            most: text.most,
+            of: "characters",
+            found,
+        }
+        .into()),
+        _ => Ok(()),
+    }
 }
 
 /// The parts of a time or duration, by the names of ROS 1 and by those of ROS 2.

@@ -45,19 +45,8 @@ impl Format for Json<'_> {
             Scalar::U64 => self.integer(u64::from_le_bytes(array(bytes))),
             Scalar::F32 => self.single(f32::from_le_bytes(array(bytes))),
             Scalar::F64 => self.double(f64::from_le_bytes(array(bytes))),
-            Scalar::Time => {
-                let (secs, nsecs) = bytes.split_at(4);
-                self.time(
-                    u32::from_le_bytes(array(secs)),
-                    u32::from_le_bytes(array(nsecs)),
-                );
-            }
-            Scalar::Duration => {
-                let (secs, nsecs) = bytes.split_at(4);
-                self.time(
-                    i32::from_le_bytes(array(secs)),
-                    i32::from_le_bytes(array(nsecs)),
-                );
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => {
+                self.time(scalar, bytes);
             }
         }
     }
@@ -101,8 +90,8 @@ impl Format for Json<'_> {
             Scalar::U64 => self.list(bytes, |json, bytes| json.integer(u64::from_le_bytes(bytes))),
             Scalar::F32 => self.list(bytes, |json, bytes| json.single(f32::from_le_bytes(bytes))),
             Scalar::F64 => self.list(bytes, |json, bytes| json.double(f64::from_le_bytes(bytes))),
-            Scalar::Time | Scalar::Duration => {
-                self.list(bytes, |json, bytes: [u8; 8]| json.scalar(scalar, &bytes));
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => {
+                self.list(bytes, |json, bytes: [u8; 8]| json.time(scalar, &bytes));
             }
         }
     }
@@ -190,11 +179,28 @@ impl Json<'_> {
         });
     }
 
-    fn time(&mut self, secs: impl itoa::Integer, nsecs: impl itoa::Integer) {
-        self.out.extend_from_slice(b"{\"secs\":");
-        self.integer(secs);
-        self.out.extend_from_slice(b",\"nsecs\":");
-        self.integer(nsecs);
+    /// Each ROS has its own names of the parts, and lets others be negative.
+    #[inline]
+    fn time(&mut self, scalar: Scalar, bytes: &[u8]) {
+        let (secs, nsecs) = bytes.split_at(4);
+        let (secs, nsecs): ([u8; 4], [u8; 4]) = (array(secs), array(nsecs));
+        let two = matches!(scalar, Scalar::Time2 | Scalar::Duration2);
+        self.out.extend_from_slice(match two {
+            false => &b"{\"secs\":"[..],
+            true => b"{\"sec\":",
+        });
+        match scalar {
+            Scalar::Time => self.integer(u32::from_le_bytes(secs)),
+            _ => self.integer(i32::from_le_bytes(secs)),
+        }
+        self.out.extend_from_slice(match two {
+            false => &b",\"nsecs\":"[..],
+            true => b",\"nanosec\":",
+        });
+        match scalar {
+            Scalar::Duration => self.integer(i32::from_le_bytes(nsecs)),
+            _ => self.integer(u32::from_le_bytes(nsecs)),
+        }
         self.out.push(b'}');
     }
 }

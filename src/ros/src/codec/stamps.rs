@@ -1,28 +1,44 @@
-//! Where in a serialized message the stamps stand: every `time` field, nested ones and those in arrays, by the
-//! message's definition. The rest is skipped, not decoded, and what follows the last stamp is not looked at.
+//! Where in a serialized message the stamps stand: every `time` field (of ROS 2: `builtin_interfaces/Time`), nested ones and
+//! those in arrays, by the message's definition. The rest is skipped, not decoded, and what follows the last stamp is not looked at.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use crate::bus::RosVersion;
 use crate::codec::Time;
+use crate::codec::cursor::Cursor;
+use crate::schema::plan::Scalar;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// A `time`: seconds and nanoseconds, four bytes each.
 const TIME: usize = 8;
+const TIME_PART: usize = 4;
 
 /// The way through one type's messages, from stamp to stamp.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Stamps {
+    version: RosVersion,
     steps: Arc<[Step]>,
+}
+
+/// None at all.
+impl Default for Stamps {
+    fn default() -> Self {
+        Self {
+            version: RosVersion::One,
+            steps: [].into(),
+        }
+    }
 }
 
 #[derive(Debug, Clone)]
 enum Step {
-    /// So many bytes.
+    /// So many bytes, one after the other whatever they are: in ROS 1.
     Skip(usize),
-    /// An array with its length before it, of items of so many bytes.
-    SkipItems(usize),
+    /// Items of so many bytes, aligned where numbers are.
+    Numbers(Items, usize, usize),
     Strings(Items),
+    WideStrings(Items),
     Times(Items),
     Messages(Items, Arc<[Step]>),
 }
@@ -37,10 +53,15 @@ enum Items {
 impl Stamps {
     /// For messages of this type.
     pub fn of(message: &MessageType) -> Self {
-        let mut steps = Compiler::default().steps(message).to_vec();
+        let mut compiler = Compiler {
+            packed: message.version() == RosVersion::One,
+            known: HashMap::new(),
+        };
+        let mut steps = compiler.steps(message).to_vec();
         let last = steps.iter().rposition(Step::holds_stamps);
         steps.truncate(last.map_or(0, |last| last + 1));
         Self {
+            version: message.version(),
             steps: steps.into(),
         }
     }
@@ -50,13 +71,16 @@ impl Stamps {
         self.steps.is_empty()
     }
 
-    /// Where the stamps begin; none where the message is not of this type (too short).
+    /// Where the stamps begin; none where the message is not of this type (too short), or not little endian, as stamps
+    /// are written.
     pub fn find(&self, message: &[u8]) -> Option<Vec<usize>> {
         let mut walk = Walk {
-            message,
-            at: 0,
+            cursor: Cursor::new(self.version, message)?,
             found: Vec::new(),
         };
+        if walk.cursor.is_big_endian() {
+            return None;
+        }
         walk.steps(&self.steps)?;
         Some(walk.found)
     }
@@ -87,8 +111,9 @@ impl Step {
 }
 
 /// Types that come more than once are compiled once: a definition may name one many times over.
-#[derive(Default)]
 struct Compiler {
+    /// Nothing is aligned.
+    packed: bool,
     known: HashMap<*const MessageType, Arc<[Step]>>,
 }
 
@@ -105,6 +130,9 @@ impl Compiler {
                 (step, _) => steps.push(step),
             }
         }
+        if message.plan.placeholder {
+            steps.push(self.skip(Items::Known(1), 1));
+        }
         let steps: Arc<[Step]> = steps.into();
         self.known.insert(key, Arc::clone(&steps));
         steps
@@ -116,29 +144,39 @@ impl Compiler {
             Arity::Fixed(count) => Items::Known(count as usize),
             Arity::Variable => Items::Counted,
         };
-        let skip = |size: usize| match items {
-            Items::Known(count) => Step::Skip(size.saturating_mul(count)),
-            Items::Counted => Step::SkipItems(size),
-        };
         match &field.base {
             Base::Primitive(Primitive::Time) => Step::Times(items),
             Base::Primitive(Primitive::String) => Step::Strings(items),
-            Base::Primitive(other) => skip(other.size()),
+            Base::Primitive(Primitive::Wstring) => Step::WideStrings(items),
+            Base::Primitive(other) => self.skip(items, other.size()),
             Base::Message(message) => {
                 let steps = self.steps(message);
-                if message.is_fixed_size() && !steps.iter().any(Step::holds_stamps) {
-                    skip(message.min_size())
+                match message.plan.scalar {
+                    Some(Scalar::Time2) => return Step::Times(items),
+                    Some(other) => {
+                        return Step::Numbers(items, other.size(), other.alignment());
+                    }
+                    None => {}
+                }
+                if self.packed && message.is_fixed_size() && !steps.iter().any(Step::holds_stamps) {
+                    self.skip(items, message.min_size())
                 } else {
                     Step::Messages(items, steps)
                 }
             }
         }
     }
+
+    fn skip(&self, items: Items, size: usize) -> Step {
+        match items {
+            Items::Known(count) if self.packed => Step::Skip(size.saturating_mul(count)),
+            _ => Step::Numbers(items, size, size),
+        }
+    }
 }
 
 struct Walk<'a> {
-    message: &'a [u8],
-    at: usize,
+    cursor: Cursor<'a>,
     found: Vec<usize>,
 }
 
@@ -147,22 +185,21 @@ impl Walk<'_> {
     fn steps(&mut self, steps: &[Step]) -> Option<()> {
         for step in steps {
             match step {
-                Step::Skip(bytes) => self.skip(*bytes)?,
-                Step::SkipItems(size) => {
-                    let count = self.number()?;
-                    self.skip(count.checked_mul(*size)?)?;
+                Step::Skip(bytes) => self.cursor.skip(1, *bytes, 1)?,
+                Step::Numbers(items, size, alignment) => {
+                    let count = self.count(*items)?;
+                    self.cursor.skip(count, *size, *alignment)?;
                 }
-                Step::Strings(items) => {
+                Step::Strings(items) | Step::WideStrings(items) => {
+                    let wide = matches!(step, Step::WideStrings(_));
                     for _ in 0..self.count(*items)? {
-                        let length = self.number()?;
-                        self.skip(length)?;
+                        self.cursor.string(wide)?;
                     }
                 }
                 Step::Times(items) => {
                     for _ in 0..self.count(*items)? {
-                        let here = self.at;
-                        self.skip(TIME)?;
-                        self.found.push(here);
+                        self.cursor.take(TIME, TIME_PART)?;
+                        self.found.push(self.cursor.at() - TIME);
                     }
                 }
                 Step::Messages(items, steps) => {
@@ -178,19 +215,8 @@ impl Walk<'_> {
     fn count(&mut self, items: Items) -> Option<usize> {
         match items {
             Items::Known(count) => Some(count),
-            Items::Counted => self.number(),
+            Items::Counted => self.cursor.length(),
         }
-    }
-
-    fn number(&mut self) -> Option<usize> {
-        let bytes = self.message.get(self.at..self.at + 4)?;
-        self.at += 4;
-        Some(u32::from_le_bytes(bytes.try_into().ok()?) as usize)
-    }
-
-    fn skip(&mut self, bytes: usize) -> Option<()> {
-        self.at = self.at.checked_add(bytes)?;
-        (self.at <= self.message.len()).then_some(())
     }
 }
 

@@ -18,7 +18,9 @@ pub(crate) fn little_endian_tag(scalar: Scalar) -> Option<u64> {
         Scalar::I64 => 79,
         Scalar::F32 => 85,
         Scalar::F64 => 86,
-        Scalar::Bool | Scalar::Time | Scalar::Duration => return None,
+        Scalar::Bool | Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => {
+            return None;
+        }
     })
 }
 

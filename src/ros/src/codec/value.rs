@@ -1,6 +1,11 @@
 //! A message as values by name, for the few that are looked into here rather than passed on.
 
+use std::borrow::Cow;
+
+use crate::bus::RosVersion;
 use crate::codec::Time;
+use crate::codec::cdr::utf8_of;
+use crate::codec::cursor::Cursor;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// A value in a serialized message.
@@ -8,9 +13,9 @@ use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 pub enum Value<'a> {
     /// Any number, and `bool` as 0 or 1. Integers beyond 2^53 are rounded.
     Number(f64),
-    /// A string's bytes.
-    Text(&'a [u8]),
-    /// A `time`, or a `duration` by its bits.
+    /// A string's bytes; of a wide one, as UTF-8.
+    Text(Cow<'a, [u8]>),
+    /// A time, or a duration by its bits.
     Time(Time),
     /// An array.
     List(Vec<Value<'a>>),
@@ -21,9 +26,14 @@ pub enum Value<'a> {
 impl<'a> Value<'a> {
     /// Reads one message; none where the bytes are no such message.
     pub fn read(of: &'a MessageType, bytes: &'a [u8]) -> Option<Self> {
-        let mut reader = Reader { rest: bytes };
+        let mut reader = Reader {
+            cursor: Cursor::new(of.version(), bytes)?,
+            version: of.version(),
+        };
         let read = reader.message(of)?;
-        reader.rest.is_empty().then_some(read)
+        // Who writes ROS 2's messages by an estimated size leaves bytes behind them.
+        let ended = reader.cursor.left() == 0 || reader.version == RosVersion::Two;
+        ended.then_some(read)
     }
 
     /// A field of a message.
@@ -53,7 +63,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// A `time`.
+    /// A time.
     pub fn time(&self) -> Option<Time> {
         match self {
             Value::Time(time) => Some(*time),
@@ -71,38 +81,29 @@ impl<'a> Value<'a> {
 }
 
 struct Reader<'a> {
-    rest: &'a [u8],
+    cursor: Cursor<'a>,
+    version: RosVersion,
 }
 
 impl<'a> Reader<'a> {
-    fn take(&mut self, count: usize) -> Option<&'a [u8]> {
-        let (taken, rest) = self.rest.split_at_checked(count)?;
-        self.rest = rest;
-        Some(taken)
-    }
-
-    fn bytes<const N: usize>(&mut self) -> Option<[u8; N]> {
-        self.take(N)?.try_into().ok()
-    }
-
-    fn length(&mut self) -> Option<usize> {
-        usize::try_from(u32::from_le_bytes(self.bytes()?)).ok()
-    }
-
     fn message(&mut self, of: &'a MessageType) -> Option<Value<'a>> {
         let fields = of.fields().iter();
         let values = fields.map(|field| Some((field.name.as_str(), self.field(field)?)));
-        values.collect::<Option<_>>().map(Value::Message)
+        let message = values.collect::<Option<_>>().map(Value::Message)?;
+        if of.plan.placeholder {
+            self.cursor.take(1, 1)?;
+        }
+        Some(message)
     }
 
     fn field(&mut self, field: &'a Field) -> Option<Value<'a>> {
         let count = match field.arity {
             Arity::One => return self.one(&field.base),
             Arity::Fixed(count) => count as usize,
-            Arity::Variable => self.length()?,
+            Arity::Variable => self.cursor.length()?,
         };
         // Items without any bytes cost nothing, so their number is bounded here.
-        if count > self.rest.len() {
+        if count > self.cursor.left() {
             return None;
         }
         let items = (0..count).map(|_| self.one(&field.base));
@@ -111,30 +112,44 @@ impl<'a> Reader<'a> {
 
     fn one(&mut self, base: &'a Base) -> Option<Value<'a>> {
         let primitive = match base {
+            Base::Message(message) if message.plan.scalar.is_some() => return self.time(),
             Base::Message(message) => return self.message(message),
             Base::Primitive(primitive) => primitive,
         };
+        let cursor = &mut self.cursor;
         Some(Value::Number(match primitive {
-            Primitive::Bool | Primitive::Uint8 => u8::from_le_bytes(self.bytes()?).into(),
-            Primitive::Int8 => i8::from_le_bytes(self.bytes()?).into(),
-            Primitive::Uint16 => u16::from_le_bytes(self.bytes()?).into(),
-            Primitive::Int16 => i16::from_le_bytes(self.bytes()?).into(),
-            Primitive::Uint32 => u32::from_le_bytes(self.bytes()?).into(),
-            Primitive::Int32 => i32::from_le_bytes(self.bytes()?).into(),
-            Primitive::Uint64 => u64::from_le_bytes(self.bytes()?) as f64,
-            Primitive::Int64 => i64::from_le_bytes(self.bytes()?) as f64,
-            Primitive::Float32 => f32::from_le_bytes(self.bytes()?).into(),
-            Primitive::Float64 => f64::from_le_bytes(self.bytes()?),
+            Primitive::Bool | Primitive::Uint8 => u8::from_le_bytes(cursor.number()?).into(),
+            Primitive::Int8 => i8::from_le_bytes(cursor.number()?).into(),
+            Primitive::Uint16 => u16::from_le_bytes(cursor.number()?).into(),
+            Primitive::Int16 => i16::from_le_bytes(cursor.number()?).into(),
+            Primitive::Uint32 => u32::from_le_bytes(cursor.number()?).into(),
+            Primitive::Int32 => i32::from_le_bytes(cursor.number()?).into(),
+            Primitive::Uint64 => u64::from_le_bytes(cursor.number()?) as f64,
+            Primitive::Int64 => i64::from_le_bytes(cursor.number()?) as f64,
+            Primitive::Float32 => f32::from_le_bytes(cursor.number()?).into(),
+            Primitive::Float64 => f64::from_le_bytes(cursor.number()?),
             Primitive::String => {
-                let length = self.length()?;
-                return self.take(length).map(Value::Text);
+                let text = cursor.string(false)?;
+                let terminated = self.version == RosVersion::Two;
+                let bare = text.strip_suffix(&[0]).filter(|_| terminated);
+                return Some(Value::Text(bare.unwrap_or(text).into()));
             }
-            Primitive::Time | Primitive::Duration => {
-                return Some(Value::Time(Time {
-                    secs: u32::from_le_bytes(self.bytes()?),
-                    nsecs: u32::from_le_bytes(self.bytes()?),
-                }));
+            Primitive::Wstring => {
+                let units = cursor.string(true)?;
+                let text = match cursor.is_big_endian() {
+                    true => utf8_of::<true>(units),
+                    false => utf8_of::<false>(units),
+                };
+                return Some(Value::Text(text.into()));
             }
+            Primitive::Time | Primitive::Duration => return self.time(),
+        }))
+    }
+
+    fn time(&mut self) -> Option<Value<'a>> {
+        Some(Value::Time(Time {
+            secs: u32::from_le_bytes(self.cursor.number()?),
+            nsecs: u32::from_le_bytes(self.cursor.number()?),
         }))
     }
 }

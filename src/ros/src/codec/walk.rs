@@ -1,12 +1,11 @@
-//! Serialized bytes, value by value, in the order of the plan. Every length is checked against what is left before
-//! anything is done with it.
+//! Serialized bytes, value by value, in the order of the plan.
 
+use crate::bus::RosVersion;
+use crate::codec::cdr::{Cdr, split_header};
 use crate::codec::fault::{CodecErrorKind, Fault};
+use crate::codec::reader::{Packed, Reader};
 use crate::schema::MessageType;
-use crate::schema::plan::{Count, Kind, Literal, Plan, Scalar};
-
-/// Elements without any bytes cost nothing on the wire, so their number is bounded here.
-const MAX_EMPTY_ELEMENTS: usize = 1 << 16;
+use crate::schema::plan::{Kind, Literal, Plan, Scalar};
 
 /// What becomes of the values.
 pub(crate) trait Format {
@@ -38,10 +37,23 @@ pub(crate) fn walk<F: Format>(
     bytes: &[u8],
     format: &mut F,
 ) -> Result<(), Fault> {
-    let mut reader = Reader { rest: bytes };
+    match message.version() {
+        RosVersion::One => walk_all(message, Packed { rest: bytes }, format),
+        RosVersion::Two => match split_header(bytes)? {
+            (body, false) => walk_all(message, Cdr::<false>::new(body), format),
+            (body, true) => walk_all(message, Cdr::<true>::new(body), format),
+        },
+    }
+}
+
+fn walk_all<R: Reader, F: Format>(
+    message: &MessageType,
+    mut reader: R,
+    format: &mut F,
+) -> Result<(), Fault> {
     walk_message(message, &mut reader, format)?;
     format.room(0)?;
-    match reader.rest.len() {
+    match reader.trailing() {
         0 => Ok(()),
         trailing => Err(CodecErrorKind::Trailing(trailing).into()),
     }
@@ -52,60 +64,61 @@ pub(crate) fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), Fault>
     walk(message, bytes, &mut Nothing)
 }
 
-fn walk_message<F: Format>(
+fn walk_message<R: Reader, F: Format>(
     message: &MessageType,
-    reader: &mut Reader<'_>,
+    reader: &mut R,
     format: &mut F,
 ) -> Result<(), Fault> {
     let plan = &message.plan;
-    if F::SKIPS && plan.fixed_size {
-        return reader.take(plan.min_size).map(drop);
+    if F::SKIPS && reader.skip(plan, 1)? {
+        return Ok(());
     }
     for step in &plan.steps {
         format.literal(plan, &step.before);
         walk_value(&step.kind, reader, format).map_err(|fault| fault.in_field(&plan.path(step)))?;
     }
     format.literal(plan, &plan.tail);
+    if R::PLACEHOLDERS && plan.placeholder {
+        reader.take(1)?;
+    }
     Ok(())
 }
 
 #[inline]
-fn walk_value<F: Format>(
+fn walk_value<R: Reader, F: Format>(
     kind: &Kind,
-    reader: &mut Reader<'_>,
+    reader: &mut R,
     format: &mut F,
 ) -> Result<(), Fault> {
     match kind {
-        Kind::Scalar(scalar) => format.scalar(*scalar, reader.take(scalar.size())?),
-        Kind::Text => {
-            let length = reader.count(Count::Variable, 1)?;
-            let text = reader.take(length)?;
+        Kind::Scalar(scalar) => format.scalar(*scalar, reader.scalar(*scalar)?),
+        Kind::Text(text) => {
+            let text = reader.text(*text)?;
             format.room(text.len())?;
             format.text(text)?;
         }
         Kind::Bytes(count) => {
-            let length = reader.count(*count, 1)?;
+            let length = reader.length(*count, 1)?;
             let bytes = reader.take(length)?;
             format.room(bytes.len())?;
             format.bytes(bytes);
         }
         Kind::Scalars(scalar, count) => {
-            let length = reader.count(*count, scalar.size())?;
-            let bytes = reader.take(length * scalar.size())?;
+            let length = reader.length(*count, scalar.size())?;
+            let bytes = reader.scalars(*scalar, length)?;
             format.room(length)?;
             format.scalars(*scalar, bytes);
         }
-        Kind::Texts(count) => {
-            let length = reader.count(*count, 4)?;
+        Kind::Texts(text, count) => {
+            let length = reader.length(*count, 4)?;
             walk_elements(length, format, |format| {
-                walk_value(&Kind::Text, reader, format)
+                walk_value(&Kind::Text(*text), reader, format)
             })?;
         }
         Kind::Struct(message) => walk_message(message, reader, format)?,
         Kind::Structs(message, count) => {
-            let length = reader.count(*count, message.plan.min_size)?;
-            if F::SKIPS && message.plan.fixed_size {
-                reader.take(length * message.plan.min_size)?;
+            let length = reader.length(*count, message.plan.min_size)?;
+            if F::SKIPS && reader.skip(&message.plan, length)? {
                 return Ok(());
             }
             walk_elements(length, format, |format| {
@@ -130,51 +143,6 @@ fn walk_elements<F: Format>(
     }
     format.end_array();
     Ok(())
-}
-
-struct Reader<'a> {
-    rest: &'a [u8],
-}
-
-impl<'a> Reader<'a> {
-    #[inline]
-    fn take(&mut self, size: usize) -> Result<&'a [u8], Fault> {
-        let Some((taken, rest)) = self.rest.split_at_checked(size) else {
-            return Err(CodecErrorKind::Truncated {
-                missing: size - self.rest.len(),
-            }
-            .into());
-        };
-        self.rest = rest;
-        Ok(taken)
-    }
-
-    /// The number of elements of an array, each of at least `min_size` bytes; that many bytes are there.
-    #[inline]
-    fn count(&mut self, count: Count, min_size: usize) -> Result<usize, Fault> {
-        let length = match count {
-            Count::Fixed(length) => length,
-            Count::Variable => {
-                let mut length = [0; 4];
-                length.copy_from_slice(self.take(4)?);
-                u32::from_le_bytes(length) as usize
-            }
-        };
-        let fits = match min_size {
-            0 => count != Count::Variable || length <= MAX_EMPTY_ELEMENTS,
-            _ => length
-                .checked_mul(min_size)
-                .is_some_and(|size| size <= self.rest.len()),
-        };
-        if !fits {
-            return Err(CodecErrorKind::LengthBeyondEnd {
-                count: length as u64,
-                left: self.rest.len(),
-            }
-            .into());
-        }
-        Ok(length)
-    }
 }
 
 /// Writes nothing.

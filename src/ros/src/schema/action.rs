@@ -1,4 +1,4 @@
-//! The messages that come from other definitions: two of a service, seven of an action (as genaction makes them).
+//! The messages of ROS 1 that come from other definitions: two of a service, seven of an action (as genaction makes them).
 
 use crate::schema::SchemaError;
 use crate::schema::text::sections;

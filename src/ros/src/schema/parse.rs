@@ -1,27 +1,48 @@
-//! One definition's text → constants and fields, references not yet looked up.
+//! One definition's text → constants and fields, references not yet looked up. What a line may say differs between
+//! versions of ROS: here is ROS 1's grammar, [`ros2`] has the other.
 
+mod ros2;
+
+use crate::bus::RosVersion;
+use crate::schema::initial::Initial;
 use crate::schema::limits::{MAX_FIELDS, MAX_NAME_BYTES};
-use crate::schema::types::{Arity, Constant, Primitive};
+use crate::schema::types::{Arity, Bounds, Constant, Primitive};
 use crate::schema::{MAX_MESSAGE_BYTES, SchemaError};
 
 /// What a text says, line by line.
-#[derive(Debug, Default, PartialEq, Eq)]
+#[derive(Debug, Default)]
 pub(crate) struct Parsed {
     pub(crate) constants: Vec<Constant>,
     pub(crate) fields: Vec<ParsedField>,
 }
 
 /// A field whose type is a name.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug)]
 pub(crate) struct ParsedField {
     pub(crate) name: String,
-    /// A built-in name or `package/Type`.
+    /// A built-in name, or a message's as [`MessageType::name`](crate::schema::MessageType::name) has it.
     pub(crate) type_name: String,
     pub(crate) arity: Arity,
+    pub(crate) bounds: Bounds,
+    pub(crate) initial: Option<Initial>,
 }
 
-/// Parses the text of message `name` (`package/Type`; relative references are relative to that package).
-pub(crate) fn parse(name: &str, text: &str) -> Result<Parsed, SchemaError> {
+impl Parsed {
+    fn add_field(&mut self, field: ParsedField) -> Result<(), String> {
+        if self.fields.iter().any(|other| other.name == field.name) {
+            return Err(format!("field {} is there twice", field.name));
+        }
+        self.fields.push(field);
+        Ok(())
+    }
+}
+
+/// Parses the text of message `name`; relative references are relative to its package.
+pub(crate) fn parse(version: RosVersion, name: &str, text: &str) -> Result<Parsed, SchemaError> {
+    let parse_line = match version {
+        RosVersion::One => parse_line,
+        RosVersion::Two => ros2::parse_line,
+    };
     let package = name.split('/').next().unwrap_or_default();
     let mut parsed = Parsed::default();
     for (index, line) in text.lines().enumerate() {
@@ -49,12 +70,7 @@ fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), Stri
         parsed.constants.push(parse_constant(line, code)?);
         return Ok(());
     }
-    let field = parse_field(package, code)?;
-    if parsed.fields.iter().any(|other| other.name == field.name) {
-        return Err(format!("field {} is there twice", field.name));
-    }
-    parsed.fields.push(field);
-    Ok(())
+    parsed.add_field(parse_field(package, code)?)
 }
 
 /// `TYPE NAME=VALUE`; a string's value runs to the end of the line, `#` and all.
@@ -97,7 +113,7 @@ fn check_constant(type_name: &str, value: &str) -> Result<(), String> {
         Some(Primitive::Uint64) => fits(0, u64::MAX.into()),
         Some(Primitive::Float32 | Primitive::Float64) => value.parse::<f64>().is_ok(),
         Some(Primitive::String) => true,
-        Some(Primitive::Time | Primitive::Duration) | None => {
+        Some(Primitive::Time | Primitive::Duration | Primitive::Wstring) | None => {
             return Err(format!("a constant cannot be of type {type_name}"));
         }
     };
@@ -119,6 +135,8 @@ fn parse_field(package: &str, code: &str) -> Result<ParsedField, String> {
         name: name.to_owned(),
         type_name: resolve_name(package, bare, brackets)?,
         arity: parse_brackets(brackets)?,
+        bounds: Bounds::default(),
+        initial: None,
     })
 }
 

@@ -7,7 +7,9 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use crate::bus::RosVersion;
 use crate::cbor_head::{MAP, TEXT, head};
+use crate::schema::initial::Initial;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// Nested messages with more steps than this are called, not flattened, as are all once the plan has grown to
@@ -18,10 +20,14 @@ const MAX_FLATTENED_JSON: usize = 4096;
 /// The compiled form of a message type.
 #[derive(Debug, Default)]
 pub(crate) struct Plan {
-    /// Fewest bytes of a message; the default message is as many zeros.
+    /// Fewest bytes of a message, what alignment adds left out; in ROS 1 the default message is as many zeros.
     pub(crate) min_size: usize,
-    /// Every message takes `min_size` bytes.
+    /// Every message takes `min_size` bytes and what alignment adds.
     pub(crate) fixed_size: bool,
+    /// In place of fields there is one byte on the wire: ROS 2's types without fields.
+    pub(crate) placeholder: bool,
+    /// This is a time or duration of ROS 2, which within other messages is a value rather than a message.
+    pub(crate) scalar: Option<Scalar>,
     /// How many values an otherwise empty message holds.
     pub(crate) values: usize,
     /// Nesting of messages, 1 for one that contains none.
@@ -65,6 +71,8 @@ pub(crate) struct Member {
     pub(crate) cbor_key: Box<[u8]>,
     pub(crate) kind: Kind,
     pub(crate) min_size: usize,
+    /// What it holds until it is set; zeros, empty texts and arrays otherwise.
+    pub(crate) initial: Option<Initial>,
 }
 
 /// A value, as output sees it.
@@ -108,14 +116,23 @@ impl Pool {
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
     Scalar(Scalar),
-    Text,
+    Text(Text),
     /// `uint8` and `char` arrays.
     Bytes(Count),
     /// Arrays of all other scalars.
     Scalars(Scalar, Count),
-    Texts(Count),
+    Texts(Text, Count),
     Struct(Arc<MessageType>),
     Structs(Arc<MessageType>, Count),
+}
+
+/// What a string holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Text {
+    /// Units of UTF-16, else bytes.
+    pub(crate) wide: bool,
+    /// Most characters.
+    pub(crate) most: usize,
 }
 
 /// Elements of an array.
@@ -123,6 +140,8 @@ pub(crate) enum Kind {
 pub(crate) enum Count {
     Fixed(usize),
     Variable,
+    /// At most so many.
+    Bounded(usize),
 }
 
 /// Values of a fixed size.
@@ -139,8 +158,13 @@ pub(crate) enum Scalar {
     U64,
     F32,
     F64,
+    /// ROS 1's.
     Time,
     Duration,
+    /// `builtin_interfaces/msg/Time`.
+    Time2,
+    /// `builtin_interfaces/msg/Duration`.
+    Duration2,
 }
 
 impl Scalar {
@@ -149,7 +173,16 @@ impl Scalar {
             Scalar::Bool | Scalar::I8 | Scalar::U8 => 1,
             Scalar::I16 | Scalar::U16 => 2,
             Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
-            Scalar::I64 | Scalar::U64 | Scalar::F64 | Scalar::Time | Scalar::Duration => 8,
+            Scalar::I64 | Scalar::U64 | Scalar::F64 => 8,
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => 8,
+        }
+    }
+
+    /// Bytes of the largest number in it, of which its place is a multiple where values are aligned.
+    pub(crate) fn alignment(self) -> usize {
+        match self {
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => 4,
+            other => other.size(),
         }
     }
 
@@ -168,7 +201,7 @@ impl Scalar {
             Primitive::Float64 => Scalar::F64,
             Primitive::Time => Scalar::Time,
             Primitive::Duration => Scalar::Duration,
-            Primitive::String => return None,
+            Primitive::String | Primitive::Wstring => return None,
         })
     }
 }
@@ -177,8 +210,17 @@ impl Count {
     /// No array of this kind has more elements.
     pub(crate) fn most(self) -> usize {
         match self {
-            Count::Fixed(count) => count,
+            Count::Fixed(count) | Count::Bounded(count) => count,
             Count::Variable => usize::MAX,
+        }
+    }
+}
+
+impl Text {
+    fn of(field: &Field, primitive: Primitive) -> Text {
+        Text {
+            wide: primitive == Primitive::Wstring,
+            most: field.bounds.text.map_or(usize::MAX, |most| most as usize),
         }
     }
 }
@@ -188,14 +230,24 @@ impl Kind {
         let count = match field.arity {
             Arity::One => None,
             Arity::Fixed(count) => Some(Count::Fixed(count as usize)),
-            Arity::Variable => Some(Count::Variable),
+            Arity::Variable => Some(match field.bounds.elements {
+                Some(most) => Count::Bounded(most as usize),
+                None => Count::Variable,
+            }),
         };
+        if let Base::Message(message) = &field.base {
+            match (message.plan.scalar, count) {
+                (None, _) => {}
+                (Some(scalar), None) => return Kind::Scalar(scalar),
+                (Some(scalar), Some(count)) => return Kind::Scalars(scalar, count),
+            }
+        }
         match (&field.base, count) {
             (Base::Message(message), None) => Kind::Struct(message.clone()),
             (Base::Message(message), Some(count)) => Kind::Structs(message.clone(), count),
             (Base::Primitive(primitive), count) => match (Scalar::of(*primitive), count) {
-                (None, None) => Kind::Text,
-                (None, Some(count)) => Kind::Texts(count),
+                (None, None) => Kind::Text(Text::of(field, *primitive)),
+                (None, Some(count)) => Kind::Texts(Text::of(field, *primitive), count),
                 (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
                 (Some(scalar), None) => Kind::Scalar(scalar),
                 (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
@@ -206,17 +258,21 @@ impl Kind {
 
 impl Plan {
     /// Works out the plan of message `name`.
-    pub(crate) fn compile(name: &str, fields: &[Field]) -> Plan {
+    pub(crate) fn compile(version: RosVersion, name: &str, fields: &[Field]) -> Plan {
         let depths = fields.iter().map(|field| match &field.base {
             Base::Message(inner) => inner.plan.depth + 1,
             Base::Primitive(_) => 1,
         });
+        let placeholder = version == RosVersion::Two && fields.is_empty();
+        let min_size: usize = fields.iter().map(Field::min_size).sum();
         let mut plan = Plan {
-            min_size: fields.iter().map(Field::min_size).sum(),
+            min_size: min_size + usize::from(placeholder),
+            placeholder,
+            scalar: scalar(version, name, fields),
             fixed_size: fields.iter().all(Field::is_fixed_size),
             values: Plan::count_values(fields),
             depth: depths.max().unwrap_or(1),
-            header: is_header(name, fields),
+            header: is_header(version, name, fields),
             members: Members::new(fields.iter().map(member).collect()),
             ..Plan::default()
         };
@@ -297,7 +353,7 @@ impl Plan {
 
     fn may_flatten(&self, inner: &Plan) -> bool {
         let small = inner.values <= MAX_FLATTENED && inner.json.0.len() <= MAX_FLATTENED_JSON;
-        small && self.json.0.len() <= MAX_FLATTENED_JSON
+        small && !inner.placeholder && self.json.0.len() <= MAX_FLATTENED_JSON
     }
 
     fn literal(&mut self, pending: &mut Pending) -> Literal {
@@ -348,6 +404,7 @@ impl Member {
             cbor_key: cbor_key(name).into(),
             kind,
             min_size,
+            initial: None,
         }
     }
 }
@@ -365,18 +422,45 @@ fn cbor_key(name: &str) -> Vec<u8> {
 }
 
 fn member(field: &Field) -> Member {
-    Member::new(&field.name, Kind::of(field), field.min_size())
+    Member {
+        initial: field.initial.clone(),
+        ..Member::new(&field.name, Kind::of(field), field.min_size())
+    }
 }
 
-/// Whether this is `std_msgs/Header` as everyone knows it, with its stamp at byte 4.
-fn is_header(name: &str, fields: &[Field]) -> bool {
-    use Primitive::{String, Time, Uint32};
-    let shape = [("seq", Uint32), ("stamp", Time), ("frame_id", String)];
-    name == "std_msgs/Header"
-        && fields.len() == shape.len()
-        && fields.iter().zip(shape).all(|(field, (name, primitive))| {
-            field.name == name
-                && field.arity == Arity::One
-                && matches!(&field.base, Base::Primitive(found) if *found == primitive)
-        })
+/// Whether these are the fields, none of them an array.
+fn is_shape(fields: &[Field], shape: &[(&str, &str)]) -> bool {
+    let alike = |(field, (name, type_name)): (&Field, &(&str, &str))| {
+        field.name == *name && field.type_name == *type_name && field.arity == Arity::One
+    };
+    fields.len() == shape.len() && fields.iter().zip(shape).all(alike)
+}
+
+/// Whether this is `std_msgs/Header` as everyone knows it, with its stamp at byte 4: after the sequence number in ROS 1,
+/// after the header of the serialization in ROS 2.
+fn is_header(version: RosVersion, name: &str, fields: &[Field]) -> bool {
+    const TIME: &str = "builtin_interfaces/msg/Time";
+    match version {
+        RosVersion::One => {
+            let shape = [("seq", "uint32"), ("stamp", "time"), ("frame_id", "string")];
+            name == "std_msgs/Header" && is_shape(fields, &shape)
+        }
+        RosVersion::Two => {
+            let shape = [("stamp", TIME), ("frame_id", "string")];
+            let stamps = || matches!(Kind::of(&fields[0]), Kind::Scalar(Scalar::Time2));
+            name == "std_msgs/msg/Header" && is_shape(fields, &shape) && stamps()
+        }
+    }
+}
+
+/// ROS 2's times as everyone knows them.
+fn scalar(version: RosVersion, name: &str, fields: &[Field]) -> Option<Scalar> {
+    let scalar = match (version, name) {
+        (RosVersion::Two, "builtin_interfaces/msg/Time") => Scalar::Time2,
+        (RosVersion::Two, "builtin_interfaces/msg/Duration") => Scalar::Duration2,
+        _ => return None,
+    };
+    let known = is_shape(fields, &[("sec", "int32"), ("nanosec", "uint32")])
+        && fields.iter().all(|field| field.initial.is_none());
+    known.then_some(scalar)
 }

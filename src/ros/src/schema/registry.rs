@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use parking_lot::RwLock;
 
+use crate::bus::RosVersion;
 use crate::schema::action::{ACTION_ENDINGS, action_message, service_message, well_known};
+use crate::schema::derived;
 use crate::schema::limits::MAX_DEFINITIONS;
 use crate::schema::parse::check_identifier;
 use crate::schema::resolve::{build_action, build_message, build_service};
@@ -13,15 +15,23 @@ use crate::schema::text::split_full_text;
 use crate::schema::types::{ActionDef, MessageType, ServiceDef};
 use crate::schema::{MAX_TEXT_BYTES, SchemaError};
 
-/// Definitions and what they resolve to. Share it by `Arc`; all methods take `&self`.
-#[derive(Debug, Default)]
+/// Definitions of one version of ROS and what they resolve to. Share it by `Arc`; all methods take `&self`.
+#[derive(Debug)]
 pub struct Registry {
     state: RwLock<State>,
 }
 
-/// Texts as given and everything resolved so far.
-#[derive(Debug, Default)]
+/// ROS 1's.
+impl Default for Registry {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Texts as given and everything resolved so far, by names as [`MessageType::name`] has them.
+#[derive(Debug)]
 pub(crate) struct State {
+    pub(crate) version: RosVersion,
     messages: HashMap<String, Arc<str>>,
     services: HashMap<String, Arc<str>>,
     actions: HashMap<String, Arc<str>>,
@@ -31,16 +41,39 @@ pub(crate) struct State {
 }
 
 impl Registry {
-    /// An empty one. `std_msgs/Header` and actionlib's own messages are known even so.
+    /// An empty one of ROS 1. `std_msgs/Header` and actionlib's own messages are known even so.
     pub fn new() -> Registry {
-        Registry::default()
+        Registry::of(RosVersion::One)
     }
 
-    /// One with these definitions, keyed as for [`insert`](Self::insert).
+    /// An empty one. Headers, times and what actions are made of are known even so.
+    pub fn of(version: RosVersion) -> Registry {
+        Registry {
+            state: RwLock::new(State {
+                version,
+                messages: HashMap::new(),
+                services: HashMap::new(),
+                actions: HashMap::new(),
+                resolved_messages: HashMap::new(),
+                resolved_services: HashMap::new(),
+                resolved_actions: HashMap::new(),
+            }),
+        }
+    }
+
+    /// One of ROS 1 with these definitions, keyed as for [`insert`](Self::insert).
     pub fn from_definitions(
         definitions: &BTreeMap<String, String>,
     ) -> Result<Registry, SchemaError> {
-        let registry = Registry::new();
+        Self::of_definitions(RosVersion::One, definitions)
+    }
+
+    /// One with these definitions, keyed as for [`insert`](Self::insert).
+    pub fn of_definitions(
+        version: RosVersion,
+        definitions: &BTreeMap<String, String>,
+    ) -> Result<Registry, SchemaError> {
+        let registry = Registry::of(version);
         for (key, text) in definitions {
             registry.insert(key, text)?;
         }
@@ -50,18 +83,20 @@ impl Registry {
     /// Adds or replaces one definition. `key` is `package/msg/Type`, `package/srv/Type`, `package/action/Name`, or
     /// `package/Type` for a message. The text is parsed when the type is first asked for.
     pub fn insert(&self, key: &str, text: &str) -> Result<(), SchemaError> {
-        let (kind, name) = split_key(key)?;
+        let mut state = self.state.write();
+        let (kind, name) = split_key(state.version, key)?;
         if text.len() > MAX_TEXT_BYTES {
             return Err(too_long(&name));
         }
-        self.state.write().insert(kind, name, text);
+        state.insert(kind, name, text);
         Ok(())
     }
 
-    /// Adds a message and all it contains from the full text that a publisher sends in its connection header.
+    /// Adds a message and all it contains from its full text, which ROS 1's publishers send in their connection header.
     /// Replaces definitions that differ.
     pub fn insert_full_text(&self, type_name: &str, text: &str) -> Result<(), SchemaError> {
-        let name = message_name(type_name)?;
+        let mut state = self.state.write();
+        let name = state.text_name(type_name)?;
         if text.len() > MAX_TEXT_BYTES {
             return Err(too_long(&name));
         }
@@ -72,9 +107,8 @@ impl Registry {
         }
         let others = others
             .into_iter()
-            .map(|(other, part)| Ok((message_name(&other)?, part)))
+            .map(|(other, part)| Ok((state.text_name(&other)?, part)))
             .collect::<Result<Vec<_>, SchemaError>>()?;
-        let mut state = self.state.write();
         state.insert(Kind::Message, name, &own);
         for (other, part) in others {
             state.insert(Kind::Message, other, &part);
@@ -83,13 +117,15 @@ impl Registry {
     }
 
     /// The message `package/Type` (or `package/msg/Type`). Messages that come with a service (`…Request`,
-    /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are found by the service or action.
+    /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are found by the service or action; those of ROS 2
+    /// (`…_Request`) by their full name too (`package/srv/Type_Request`).
     pub fn message(&self, name: &str) -> Result<Arc<MessageType>, SchemaError> {
         if let Some(found) = self.state.read().resolved_messages.get(name) {
             return Ok(found.clone());
         }
-        let name = message_name(name)?;
-        build_message(&mut self.state.write(), &name)
+        let mut state = self.state.write();
+        let name = state.message_name(name)?;
+        build_message(&mut state, &name)
     }
 
     /// The service `package/Type` (or `package/srv/Type`).
@@ -97,8 +133,12 @@ impl Registry {
         if let Some(found) = self.state.read().resolved_services.get(name) {
             return Ok(found.clone());
         }
-        let name = plain_name(name, "srv")?;
-        build_service(&mut self.state.write(), &name)
+        let mut state = self.state.write();
+        let name = match state.version {
+            RosVersion::One => plain_name(name, "srv")?,
+            RosVersion::Two => full_name(name, "srv")?,
+        };
+        build_service(&mut state, &name)
     }
 
     /// The action `package/Name` (or `package/action/Name`).
@@ -106,14 +146,19 @@ impl Registry {
         if let Some(found) = self.state.read().resolved_actions.get(name) {
             return Ok(found.clone());
         }
-        let name = plain_name(name, "action")?;
-        build_action(&mut self.state.write(), &name)
+        let mut state = self.state.write();
+        let name = match state.version {
+            RosVersion::One => plain_name(name, "action")?,
+            RosVersion::Two => full_name(name, "action")?,
+        };
+        build_action(&mut state, &name)
     }
 
     /// Names of all messages, services and actions given, sorted, each as `package/msg/Type`, `package/srv/Type` or
     /// `package/action/Name`.
     pub fn keys(&self) -> Vec<String> {
         let state = self.state.read();
+        let full = state.version == RosVersion::Two;
         let kinds = [
             ("msg", &state.messages),
             ("srv", &state.services),
@@ -122,9 +167,10 @@ impl Registry {
         let mut keys: Vec<String> = kinds
             .into_iter()
             .flat_map(|(kind, texts)| {
-                texts
-                    .keys()
-                    .map(move |name| name.replacen('/', &format!("/{kind}/"), 1))
+                texts.keys().map(move |name| match full {
+                    true => name.clone(),
+                    false => name.replacen('/', &format!("/{kind}/"), 1),
+                })
             })
             .collect();
         keys.sort();
@@ -133,10 +179,19 @@ impl Registry {
 }
 
 impl MessageType {
-    /// A message from its full text alone, as a publisher's connection header has it, whatever definitions anyone
-    /// else uses.
+    /// A message of ROS 1 from its full text alone, as a publisher's connection header has it, whatever definitions
+    /// anyone else uses.
     pub fn from_full_text(name: &str, text: &str) -> Result<Arc<MessageType>, SchemaError> {
-        let registry = Registry::new();
+        Self::of_full_text(RosVersion::One, name, text)
+    }
+
+    /// A message from its full text alone.
+    pub fn of_full_text(
+        version: RosVersion,
+        name: &str,
+        text: &str,
+    ) -> Result<Arc<MessageType>, SchemaError> {
+        let registry = Registry::of(version);
         registry.insert_full_text(name, text)?;
         registry.message(name)
     }
@@ -171,6 +226,13 @@ impl State {
         if let Some(text) = self.messages.get(name) {
             return Ok(Some(text.clone()));
         }
+        match self.version {
+            RosVersion::One => self.derived_text(name),
+            RosVersion::Two => self.derived_text_of_two(name),
+        }
+    }
+
+    fn derived_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
         for (ending, request) in [("Request", true), ("Response", false)] {
             if let Some((service, text)) = owner(&self.services, name, ending) {
                 return Ok(Some(service_message(service, text, request)?.into()));
@@ -184,8 +246,56 @@ impl State {
         Ok(well_known(name).map(Into::into))
     }
 
+    fn derived_text_of_two(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
+        // The names of services and actions may have underscores themselves.
+        let ends = name.match_indices('_').map(|(at, _)| at);
+        for end in ends.chain([name.len()]) {
+            let (owner, ending) = name.split_at(end);
+            let given = self.services.get(owner).map(|text| &**text);
+            if let Some(text) = given.or_else(|| derived::well_known_service(owner)) {
+                if let Some(text) = derived::of_service(owner, text, ending)? {
+                    return Ok(Some(text.into()));
+                }
+            }
+            if let Some(text) = self.actions.get(owner) {
+                if let Some(text) = derived::of_action(owner, text, ending)? {
+                    return Ok(Some(text.into()));
+                }
+            }
+        }
+        Ok(derived::well_known(name).map(Into::into))
+    }
+
+    /// The name of a message of which the text is given.
+    fn text_name(&self, name: &str) -> Result<String, SchemaError> {
+        match self.version {
+            RosVersion::One => plain_name(name, "msg"),
+            RosVersion::Two => full_name(name, "msg"),
+        }
+    }
+
+    /// The name of a message that is asked for.
+    fn message_name(&self, name: &str) -> Result<String, SchemaError> {
+        let given = self.text_name(name)?;
+        let short = name.split_once('/').map_or("", |(_, short)| short);
+        let derived = self.version == RosVersion::Two && !short.contains('/');
+        if derived && short.contains('_') && !self.messages.contains_key(&given) {
+            for kind in ["srv", "action"] {
+                let derived = full_name(name, kind)?;
+                if self.message_text(&derived)?.is_some() {
+                    return Ok(derived);
+                }
+            }
+        }
+        Ok(given)
+    }
+
     pub(crate) fn has_service(&self, name: &str) -> bool {
-        self.services.contains_key(name)
+        match self.version {
+            RosVersion::One => self.services.contains_key(name),
+            // Those of actions are derived.
+            RosVersion::Two => matches!(self.message_text(name), Ok(Some(_))),
+        }
     }
 
     pub(crate) fn has_action(&self, name: &str) -> bool {
@@ -202,7 +312,7 @@ fn owner<'a>(
     Some((name, text))
 }
 
-fn split_key(key: &str) -> Result<(Kind, String), SchemaError> {
+fn split_key(version: RosVersion, key: &str) -> Result<(Kind, String), SchemaError> {
     let parts: Vec<&str> = key.split('/').collect();
     let (package, kind, short) = match parts[..] {
         [package, short] | [package, "msg", short] => (package, Kind::Message, short),
@@ -212,11 +322,26 @@ fn split_key(key: &str) -> Result<(Kind, String), SchemaError> {
     };
     let legal = check_identifier(package).and_then(|()| check_identifier(short));
     legal.map_err(|_| SchemaError::BadName(key.chars().take(100).collect()))?;
-    Ok((kind, format!("{package}/{short}")))
+    let name = match (version, kind) {
+        (RosVersion::One, _) => format!("{package}/{short}"),
+        (RosVersion::Two, Kind::Message) => format!("{package}/msg/{short}"),
+        (RosVersion::Two, _) => key.to_owned(),
+    };
+    Ok((kind, name))
 }
 
-fn message_name(name: &str) -> Result<String, SchemaError> {
-    plain_name(name, "msg")
+/// `package/<kind>/Type` of `package/Type` or of itself, whatever its kind.
+fn full_name(name: &str, kind: &str) -> Result<String, SchemaError> {
+    let bad = || SchemaError::BadName(name.chars().take(100).collect());
+    let parts: Vec<&str> = name.split('/').collect();
+    let (package, kind, short) = match parts[..] {
+        [package, short] => (package, kind, short),
+        [package, kind @ ("msg" | "srv" | "action"), short] => (package, kind, short),
+        _ => return Err(bad()),
+    };
+    let legal = check_identifier(package).and_then(|()| check_identifier(short));
+    legal.map_err(|_| bad())?;
+    Ok(format!("{package}/{kind}/{short}"))
 }
 
 /// `package/Type` of `package/Type` or `package/<kind>/Type`.

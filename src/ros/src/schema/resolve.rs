@@ -1,14 +1,17 @@
-//! Names → types: dependencies first, each once, then MD5 and the codec's plan.
+//! Names → types: dependencies first, each once, then digest and the codec's plan.
 
 use std::sync::{Arc, OnceLock};
 
 use md5::{Digest, Md5};
 
+use crate::bus::RosVersion;
 use crate::schema::limits::{MAX_DEPTH, MAX_MESSAGE_BYTES, MAX_VALUES};
 use crate::schema::parse::{Parsed, ParsedField, parse};
 use crate::schema::plan::Plan;
 use crate::schema::registry::State;
-use crate::schema::types::{ActionDef, Base, Field, MessageType, Primitive, ServiceDef};
+use crate::schema::types::{
+    ActionDef, ActionServices, Base, Field, MessageType, Primitive, ServiceDef,
+};
 use crate::schema::{Arity, SchemaError};
 
 /// Resolves message `name` (`package/Type`) and all it contains.
@@ -31,14 +34,24 @@ pub(crate) fn build_service(state: &mut State, name: &str) -> Result<Arc<Service
     if !state.has_service(name) {
         return Err(SchemaError::Unknown(name.to_owned()));
     }
-    let request = build_message(state, &format!("{name}Request"))?;
-    let response = build_message(state, &format!("{name}Response"))?;
-    let mut hash = Md5::new();
-    hash.update(md5_text(&request));
-    hash.update(md5_text(&response));
+    let ending = match state.version {
+        RosVersion::One => "",
+        RosVersion::Two => "_",
+    };
+    let request = build_message(state, &format!("{name}{ending}Request"))?;
+    let response = build_message(state, &format!("{name}{ending}Response"))?;
+    let digest = match state.version {
+        RosVersion::One => {
+            let mut hash = Md5::new();
+            hash.update(md5_text(&request));
+            hash.update(md5_text(&response));
+            hex::encode(hash.finalize())
+        }
+        RosVersion::Two => build_message(state, name)?.digest().to_owned(),
+    };
     let service = Arc::new(ServiceDef {
         name: name.to_owned(),
-        md5: hex::encode(hash.finalize()),
+        md5: digest,
         request,
         response,
     });
@@ -53,11 +66,22 @@ pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDe
     if let Some(known) = state.resolved_actions.get(name) {
         return Ok(known.clone());
     }
+    let action = Arc::new(match state.version {
+        RosVersion::One => action_of_one(state, name)?,
+        RosVersion::Two => action_of_two(state, name)?,
+    });
+    state
+        .resolved_actions
+        .insert(name.to_owned(), action.clone());
+    Ok(action)
+}
+
+fn action_of_one(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
     if !state.has_action(name) && state.message_text(&format!("{name}Action"))?.is_none() {
         return Err(SchemaError::Unknown(name.to_owned()));
     }
     let mut part = |ending: &str| build_message(state, &format!("{name}{ending}"));
-    let action = Arc::new(ActionDef {
+    Ok(ActionDef {
         name: name.to_owned(),
         action: part("Action")?,
         action_goal: part("ActionGoal")?,
@@ -66,11 +90,30 @@ pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDe
         goal: part("Goal")?,
         result: part("Result")?,
         feedback: part("Feedback")?,
-    });
-    state
-        .resolved_actions
-        .insert(name.to_owned(), action.clone());
-    Ok(action)
+        services: None,
+    })
+}
+
+fn action_of_two(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
+    if !state.has_action(name) {
+        return Err(SchemaError::Unknown(name.to_owned()));
+    }
+    let services = ActionServices {
+        send_goal: build_service(state, &format!("{name}_SendGoal"))?,
+        get_result: build_service(state, &format!("{name}_GetResult"))?,
+    };
+    let mut part = |ending: &str| build_message(state, &format!("{name}{ending}"));
+    Ok(ActionDef {
+        name: name.to_owned(),
+        action: part("")?,
+        action_goal: services.send_goal.request.clone(),
+        action_result: services.get_result.response.clone(),
+        action_feedback: part("_FeedbackMessage")?,
+        goal: part("_Goal")?,
+        result: part("_Result")?,
+        feedback: part("_Feedback")?,
+        services: Some(services),
+    })
 }
 
 struct Resolver<'a> {
@@ -117,25 +160,30 @@ impl Resolver<'_> {
     }
 
     fn resolve(&mut self, name: &str, text: Arc<str>) -> Result<Arc<MessageType>, SchemaError> {
+        let version = self.state.version;
         let Parsed {
             constants,
             fields: parsed,
-        } = parse(name, &text)?;
+        } = parse(version, name, &text)?;
         let fields = parsed
-            .iter()
+            .into_iter()
             .map(|field| self.field(field))
             .collect::<Result<Vec<_>, _>>()?;
         check_size(name, &fields)?;
-        let mut message = MessageType {
+        let message = MessageType {
+            version,
             name: name.to_owned(),
             text,
-            md5: String::new(),
-            plan: Plan::compile(name, &fields),
+            digest: OnceLock::new(),
+            plan: Plan::compile(version, name, &fields),
             fields,
             constants,
             full_text: OnceLock::new(),
         };
-        message.md5 = hex::encode(Md5::digest(md5_text(&message)));
+        if version == RosVersion::One {
+            let digest = hex::encode(Md5::digest(md5_text(&message)));
+            message.digest.get_or_init(|| digest);
+        }
         // The depth of what is inside was checked where it was first resolved, perhaps from elsewhere.
         if message.plan.depth > MAX_DEPTH {
             return Err(too_large(
@@ -146,16 +194,18 @@ impl Resolver<'_> {
         Ok(Arc::new(message))
     }
 
-    fn field(&mut self, parsed: &ParsedField) -> Result<Field, SchemaError> {
-        let base = match Primitive::from_name(&parsed.type_name) {
+    fn field(&mut self, parsed: ParsedField) -> Result<Field, SchemaError> {
+        let base = match Primitive::named(self.state.version, &parsed.type_name) {
             Some(primitive) => Base::Primitive(primitive),
             None => Base::Message(self.message(&parsed.type_name)?),
         };
         Ok(Field {
-            name: parsed.name.clone(),
-            type_name: parsed.type_name.clone(),
+            name: parsed.name,
+            type_name: parsed.type_name,
             base,
             arity: parsed.arity,
+            bounds: parsed.bounds,
+            initial: parsed.initial,
         })
     }
 }

@@ -3,10 +3,14 @@
 use std::fmt;
 use std::sync::{Arc, OnceLock};
 
+use crate::bus::RosVersion;
+use crate::schema::description::type_hash;
+use crate::schema::initial::Initial;
 use crate::schema::plan::Plan;
 use crate::schema::text::full_text;
 
-/// The types that need no definition. `byte` is [`Primitive::Int8`] and `char` is [`Primitive::Uint8`].
+/// The types that need no definition. `char` is [`Primitive::Uint8`]; `byte` is [`Primitive::Int8`] in ROS 1 and
+/// [`Primitive::Uint8`] in ROS 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Primitive {
     /// One byte; anything but 0 is true.
@@ -15,7 +19,7 @@ pub enum Primitive {
     Int8,
     /// Also written `char`.
     Uint8,
-    /// Two bytes, little endian, as all that follow.
+    /// Two bytes; in ROS 1 little endian, as all that follow.
     Int16,
     /// Two bytes.
     Uint16,
@@ -33,14 +37,27 @@ pub enum Primitive {
     Float64,
     /// A four-byte length and so many bytes, UTF-8 by custom.
     String,
-    /// `uint32 secs, uint32 nsecs`.
+    /// `uint32 secs, uint32 nsecs`; ROS 1's own.
     Time,
-    /// `int32 secs, int32 nsecs`.
+    /// `int32 secs, int32 nsecs`; ROS 1's own.
     Duration,
+    /// A four-byte length and so many units of UTF-16; ROS 2's own.
+    Wstring,
 }
 
 impl Primitive {
-    /// The primitive of this name, aliases included.
+    /// The primitive of this name in a version of ROS, aliases included.
+    pub fn named(version: RosVersion, name: &str) -> Option<Primitive> {
+        match (version, name) {
+            (RosVersion::One, _) => Self::from_name(name),
+            (RosVersion::Two, "byte") => Some(Primitive::Uint8),
+            (RosVersion::Two, "wstring") => Some(Primitive::Wstring),
+            (RosVersion::Two, "time" | "duration") => None,
+            (RosVersion::Two, _) => Self::from_name(name),
+        }
+    }
+
+    /// The primitive of this name in ROS 1, aliases included.
     pub fn from_name(name: &str) -> Option<Primitive> {
         Some(match name {
             "bool" => Primitive::Bool,
@@ -78,6 +95,7 @@ impl Primitive {
             Primitive::String => "string",
             Primitive::Time => "time",
             Primitive::Duration => "duration",
+            Primitive::Wstring => "wstring",
         }
     }
 
@@ -86,7 +104,11 @@ impl Primitive {
         match self {
             Primitive::Bool | Primitive::Int8 | Primitive::Uint8 => 1,
             Primitive::Int16 | Primitive::Uint16 => 2,
-            Primitive::Int32 | Primitive::Uint32 | Primitive::Float32 | Primitive::String => 4,
+            Primitive::Int32
+            | Primitive::Uint32
+            | Primitive::Float32
+            | Primitive::String
+            | Primitive::Wstring => 4,
             Primitive::Int64
             | Primitive::Uint64
             | Primitive::Float64
@@ -107,6 +129,15 @@ pub enum Arity {
     Variable,
 }
 
+/// What ROS 2 lets a definition bound (`string<=8[<=3]`). Writers keep to it; readers do not check, as nodes do not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Bounds {
+    /// Most characters of the text, or of each.
+    pub text: Option<u32>,
+    /// Most elements of an array of [`Arity::Variable`].
+    pub elements: Option<u32>,
+}
+
 /// What a field's values are.
 #[derive(Debug, Clone)]
 pub enum Base {
@@ -121,16 +152,20 @@ pub enum Base {
 pub struct Field {
     /// As in the definition.
     pub name: String,
-    /// Without brackets, references resolved: `byte`, `std_msgs/Header`.
+    /// Without brackets and bounds, references resolved: `byte`, `std_msgs/Header` (of ROS 2: `std_msgs/msg/Header`).
     pub type_name: String,
     /// The type of the field, or of each element.
     pub base: Base,
     /// Single value or array.
     pub arity: Arity,
+    /// None in ROS 1.
+    pub bounds: Bounds,
+    /// What it holds until it is set, where the definition says so.
+    pub(crate) initial: Option<Initial>,
 }
 
 impl Field {
-    /// Fewest bytes the field takes; its default is as many zeros.
+    /// Fewest bytes the field takes, what alignment adds left out; in ROS 1 its default is as many zeros.
     pub fn min_size(&self) -> usize {
         let one = match &self.base {
             Base::Primitive(primitive) => primitive.size(),
@@ -143,10 +178,12 @@ impl Field {
         }
     }
 
-    /// Whether it always takes [`min_size`](Self::min_size).
+    /// Whether it always takes [`min_size`](Self::min_size) and what alignment adds.
     pub fn is_fixed_size(&self) -> bool {
         let one = match &self.base {
-            Base::Primitive(primitive) => *primitive != Primitive::String,
+            Base::Primitive(primitive) => {
+                !matches!(primitive, Primitive::String | Primitive::Wstring)
+            }
             Base::Message(message) => message.is_fixed_size(),
         };
         match self.arity {
@@ -164,15 +201,18 @@ pub struct Constant {
     pub name: String,
     /// As in the definition.
     pub type_name: String,
-    /// The text right of `=`, without surrounding space, and without a comment unless the type is `string`.
+    /// The text right of `=`, without surrounding space, and without a comment unless the type is `string`; of ROS 2
+    /// without the quotes either.
     pub value: String,
 }
 
 /// A message, all references resolved.
 pub struct MessageType {
+    pub(crate) version: RosVersion,
     pub(crate) name: String,
     pub(crate) text: Arc<str>,
-    pub(crate) md5: String,
+    /// Of ROS 2 only worked out when it is asked for: it needs all messages within.
+    pub(crate) digest: OnceLock<String>,
     pub(crate) fields: Vec<Field>,
     pub(crate) constants: Vec<Constant>,
     pub(crate) plan: Plan,
@@ -180,14 +220,25 @@ pub struct MessageType {
 }
 
 impl MessageType {
-    /// `package/Type`.
+    /// Which ROS it is of, and so how its messages are serialized.
+    pub fn version(&self) -> RosVersion {
+        self.version
+    }
+
+    /// `package/Type`; of ROS 2 `package/msg/Type`, or with `srv` or `action` where it comes with one.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// MD5 as genmsg computes it, 32 lower-case hex digits.
+    /// What tells it from other definitions of its name: MD5 as genmsg computes it, 32 lower-case hex digits; of ROS 2
+    /// the type hash, `RIHS01_` and 64 (REP 2016).
+    pub fn digest(&self) -> &str {
+        self.digest.get_or_init(|| type_hash(self))
+    }
+
+    /// The same, by the name that it has in ROS 1.
     pub fn md5(&self) -> &str {
-        &self.md5
+        self.digest()
     }
 
     /// Its own text, as given.
@@ -210,12 +261,13 @@ impl MessageType {
         &self.constants
     }
 
-    /// Fewest bytes a message takes; the default message is as many zeros.
+    /// Fewest bytes a message takes, what alignment adds and the header of ROS 2's serialization left out. In ROS 1 the
+    /// default message is as many zeros; [`default_message`](crate::codec::default_message) knows it for both.
     pub fn min_size(&self) -> usize {
         self.plan.min_size
     }
 
-    /// Whether every message takes [`min_size`](Self::min_size) bytes.
+    /// Whether every message takes [`min_size`](Self::min_size) bytes and what alignment adds.
     pub fn is_fixed_size(&self) -> bool {
         self.plan.fixed_size
     }
@@ -236,40 +288,53 @@ impl MessageType {
 
 impl fmt::Debug for MessageType {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {}", self.name, self.md5)
+        write!(f, "{} {}", self.name, self.digest())
     }
 }
 
 /// A service, all references resolved.
 #[derive(Debug, Clone)]
 pub struct ServiceDef {
-    /// `package/Type`.
+    /// `package/Type`; of ROS 2 `package/srv/Type`.
     pub name: String,
-    /// MD5 of request and response together.
+    /// Digest of request and response together: MD5, or ROS 2's type hash.
     pub md5: String,
-    /// `package/TypeRequest`.
+    /// `package/TypeRequest`; of ROS 2 `package/srv/Type_Request`.
     pub request: Arc<MessageType>,
-    /// `package/TypeResponse`.
+    /// `package/TypeResponse`; of ROS 2 `package/srv/Type_Response`.
     pub response: Arc<MessageType>,
 }
 
-/// An action and the seven messages that genaction makes of it.
+/// An action and the messages that its generator makes of it. Names are those of ROS 1's genaction, `Name` in front;
+/// ROS 2 has others of the same use.
 #[derive(Debug, Clone)]
 pub struct ActionDef {
-    /// `package/Name`.
+    /// `package/Name`; of ROS 2 `package/action/Name`.
     pub name: String,
-    /// `NameAction`: the three below that have a header.
+    /// `Action`: the three below that say whose goal it is. Of ROS 2 the action as a type, whose digest is the action's.
     pub action: Arc<MessageType>,
-    /// `NameActionGoal`: header, goal id, goal; the type of topic `goal`.
+    /// `ActionGoal`: header, goal id, goal; the type of topic `goal`. Of ROS 2 `_SendGoal_Request`: goal id, goal.
     pub action_goal: Arc<MessageType>,
-    /// `NameActionResult`: header, status, result; the type of topic `result`.
+    /// `ActionResult`: header, status, result; the type of topic `result`. Of ROS 2 `_GetResult_Response`: status, result.
     pub action_result: Arc<MessageType>,
-    /// `NameActionFeedback`: header, status, feedback; the type of topic `feedback`.
+    /// `ActionFeedback`: header, status, feedback; the type of topic `feedback`. Of ROS 2 `_FeedbackMessage`: goal id,
+    /// feedback.
     pub action_feedback: Arc<MessageType>,
-    /// `NameGoal`.
+    /// `Goal`.
     pub goal: Arc<MessageType>,
-    /// `NameResult`.
+    /// `Result`.
     pub result: Arc<MessageType>,
-    /// `NameFeedback`.
+    /// `Feedback`.
     pub feedback: Arc<MessageType>,
+    /// What ROS 2 sends goals and asks for results by; none in ROS 1.
+    pub services: Option<ActionServices>,
+}
+
+/// The services of a ROS 2 action, beside the one that cancels, whose type all actions share.
+#[derive(Debug, Clone)]
+pub struct ActionServices {
+    /// `package/action/Name_SendGoal`.
+    pub send_goal: Arc<ServiceDef>,
+    /// `package/action/Name_GetResult`.
+    pub get_result: Arc<ServiceDef>,
 }

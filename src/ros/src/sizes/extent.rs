@@ -1,6 +1,8 @@
 //! Width and height of serialized messages: from the whole numbers of these names that a message or one in it has (pictures,
 //! clouds, grids), and from the picture itself where that is a JPEG or PNG file (`sensor_msgs/CompressedImage`).
 
+use crate::bus::RosVersion;
+use crate::codec::cursor::Cursor;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// Steps to the numbers; types with more before them are not looked at.
@@ -13,19 +15,20 @@ const LARGEST: u64 = 1 << 31;
 /// The way to the width and height of one type's messages.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Extent {
+    version: RosVersion,
     steps: Vec<Step>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Step {
-    /// So many bytes.
-    Skip(usize),
-    /// An array with its length before it, of items of so many bytes.
-    Items(usize),
-    /// Strings with their lengths before them.
-    Strings(usize),
+    /// So many items of so many bytes, aligned where numbers are.
+    Items(usize, usize, usize),
+    /// The same, with their number before them.
+    CountedItems(usize, usize),
+    /// Strings with their lengths before them, wide ones or not.
+    Strings(usize, bool),
     /// Strings, with their number before them.
-    CountedStrings,
+    CountedStrings(bool),
     Width(Primitive),
     Height(Primitive),
     /// A JPEG or PNG file with its length before it.
@@ -36,42 +39,49 @@ impl Extent {
     /// For messages of this type; none where it does not say so.
     pub fn of(message: &MessageType) -> Option<Extent> {
         let mut steps = Vec::new();
-        let found = if message.name() == "sensor_msgs/CompressedImage" {
+        let file = matches!(
+            message.name(),
+            "sensor_msgs/CompressedImage" | "sensor_msgs/msg/CompressedImage"
+        );
+        let found = if file {
             to_file(message, &mut steps)
         } else if has_sides(message) {
             to_sides(message, &mut steps)
         } else {
             within(message, &mut steps)
         };
-        found.map(|()| Extent { steps })
+        found.map(|()| Extent {
+            version: message.version(),
+            steps,
+        })
     }
 
     /// Width and height of a message; none where it says none.
     pub fn find(&self, message: &[u8]) -> Option<(u64, u64)> {
         let mut walk = Walk {
-            rest: message,
+            cursor: Cursor::new(self.version, message)?,
             parts: 0,
         };
         let (mut width, mut height) = (None, None);
         for step in &self.steps {
             match *step {
-                Step::Skip(bytes) => {
-                    walk.take(bytes)?;
+                Step::Items(count, size, alignment) => {
+                    walk.cursor.skip(count, size, alignment)?;
                 }
-                Step::Items(size) => {
-                    let count = walk.count()?;
-                    walk.take(count.checked_mul(size)?)?;
+                Step::CountedItems(size, alignment) => {
+                    let count = walk.cursor.length()?;
+                    walk.cursor.skip(count, size, alignment)?;
                 }
-                Step::Strings(count) => walk.strings(count)?,
-                Step::CountedStrings => {
-                    let count = walk.count()?;
-                    walk.strings(count)?;
+                Step::Strings(count, wide) => walk.strings(count, wide)?,
+                Step::CountedStrings(wide) => {
+                    let count = walk.cursor.length()?;
+                    walk.strings(count, wide)?;
                 }
                 Step::Width(primitive) => width = Some(walk.side(primitive)?),
                 Step::Height(primitive) => height = Some(walk.side(primitive)?),
                 Step::File => {
-                    let bytes = walk.count()?;
-                    return of_file(walk.take(bytes)?);
+                    let bytes = walk.cursor.length()?;
+                    return of_file(walk.cursor.take(bytes, 1)?);
                 }
             }
         }
@@ -149,64 +159,71 @@ fn over(field: &Field, steps: &mut Vec<Step>) -> Option<()> {
         Arity::Fixed(count) => Some(count as usize),
         Arity::Variable => None,
     };
-    let size = match &field.base {
-        Base::Primitive(Primitive::String) => None,
-        Base::Primitive(primitive) => Some(primitive.size()),
-        Base::Message(message) if message.is_fixed_size() => Some(message.min_size()),
-        Base::Message(message) => {
-            // In an array each one has its own size.
-            if times != Some(1) {
-                return None;
-            }
+    let message = match &field.base {
+        Base::Message(message) => message,
+        Base::Primitive(primitive) => {
+            let (size, wide) = (primitive.size(), *primitive == Primitive::Wstring);
+            let is_text = wide || *primitive == Primitive::String;
+            // ROS 1's times are not aligned.
+            steps.push(match (is_text, times) {
+                (false, Some(times)) => Step::Items(times, size, size),
+                (false, None) => Step::CountedItems(size, size),
+                (true, Some(times)) => Step::Strings(times, wide),
+                (true, None) => Step::CountedStrings(wide),
+            });
+            return (steps.len() <= MOST_STEPS).then_some(());
+        }
+    };
+    let one_size = match message.plan.scalar {
+        Some(scalar) => Some((scalar.size(), scalar.alignment())),
+        None => {
+            let packed = message.version() == RosVersion::One && message.is_fixed_size();
+            packed.then(|| (message.min_size(), 1))
+        }
+    };
+    match (one_size, times) {
+        (Some((size, alignment)), Some(times)) => steps.push(Step::Items(times, size, alignment)),
+        (Some((size, alignment)), None) => steps.push(Step::CountedItems(size, alignment)),
+        (None, Some(1)) => {
             for field in message.fields() {
                 over(field, steps)?;
             }
-            return Some(());
+            if message.plan.placeholder {
+                steps.push(Step::Items(1, 1, 1));
+            }
         }
-    };
-    steps.push(match (size, times) {
-        (Some(size), Some(times)) => Step::Skip(size.checked_mul(times)?),
-        (Some(size), None) => Step::Items(size),
-        (None, Some(times)) => Step::Strings(times),
-        (None, None) => Step::CountedStrings,
-    });
+        // In an array each one has its own size.
+        (None, _) => return None,
+    }
     (steps.len() <= MOST_STEPS).then_some(())
 }
 
 struct Walk<'a> {
-    rest: &'a [u8],
+    cursor: Cursor<'a>,
     parts: usize,
 }
 
-impl<'a> Walk<'a> {
-    fn take(&mut self, bytes: usize) -> Option<&'a [u8]> {
-        let (taken, rest) = self.rest.split_at_checked(bytes)?;
-        self.rest = rest;
-        Some(taken)
-    }
-
-    fn count(&mut self) -> Option<usize> {
-        let bytes = self.take(4)?.try_into().ok()?;
-        Some(u32::from_le_bytes(bytes) as usize)
-    }
-
-    fn strings(&mut self, count: usize) -> Option<()> {
+impl Walk<'_> {
+    fn strings(&mut self, count: usize, wide: bool) -> Option<()> {
         for _ in 0..count {
             self.parts += 1;
             if self.parts > MOST_PARTS {
                 return None;
             }
-            let bytes = self.count()?;
-            self.take(bytes)?;
+            self.cursor.string(wide)?;
         }
         Some(())
     }
 
     /// A whole number. One below zero is far beyond any size.
     fn side(&mut self, primitive: Primitive) -> Option<u64> {
-        let bytes = self.take(primitive.size())?;
+        let size = primitive.size();
+        let bytes = self.cursor.take(size, size)?;
         let mut all = [0; 8];
-        all.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        all.get_mut(..size)?.copy_from_slice(bytes);
+        if self.cursor.is_big_endian() {
+            all[..size].reverse();
+        }
         let number = u64::from_le_bytes(all);
         let below_zero = match primitive {
             Primitive::Int8 => number > i8::MAX as u64,

@@ -1,0 +1,182 @@
+//! A line of a ROS 2 definition (<https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html>): bounds
+//! (`string<=8`, `int32[<=3]`), `wstring`, and values that fields have until they are set.
+
+use crate::bus::RosVersion;
+use crate::schema::MAX_MESSAGE_BYTES;
+use crate::schema::initial::{Initial, Item, item, quoted_end};
+use crate::schema::parse::{Parsed, ParsedField, check_identifier};
+use crate::schema::types::{Arity, Bounds, Constant, Primitive};
+
+/// Adds what the line says. References are relative to `package`.
+pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), String> {
+    let line = line.trim();
+    if line.is_empty() || line.starts_with('#') {
+        return Ok(());
+    }
+    let (written, rest) = line
+        .split_once([' ', '\t'])
+        .filter(|(written, _)| !written.contains('#'))
+        .ok_or_else(|| format!("{line:?} is not a field, write TYPE NAME"))?;
+    let rest = rest.trim_start();
+    let name_ends = |byte: char| !byte.is_ascii_alphanumeric() && byte != '_';
+    let (name, rest) = rest.split_at(rest.find(name_ends).unwrap_or(rest.len()));
+    check_identifier(name)?;
+    let rest = rest.trim_start();
+    match rest.strip_prefix('=') {
+        Some(value) => {
+            let constant = constant(written, name, value_of(value)?)?;
+            parsed.constants.push(constant);
+            Ok(())
+        }
+        None => parsed.add_field(field(package, written, name, value_of(rest)?)?),
+    }
+}
+
+/// The value, without the comment that may follow it.
+fn value_of(rest: &str) -> Result<&str, String> {
+    let rest = rest.trim();
+    let Some(end) = quoted_end(rest) else {
+        let listed = rest.starts_with('[').then(|| list_end(rest)).flatten();
+        let end = listed.or_else(|| rest.find('#'));
+        return Ok(rest[..end.unwrap_or(rest.len())].trim_end());
+    };
+    let (value, after) = rest.split_at(end);
+    match after.trim_start() {
+        "" => Ok(value),
+        comment if comment.starts_with('#') => Ok(value),
+        more => Err(format!("{more:?} follows the closing quote")),
+    }
+}
+
+/// Where a list ends: after the bracket that is in no quotes.
+fn list_end(rest: &str) -> Option<usize> {
+    let mut at = 1;
+    loop {
+        let more = &rest[at..];
+        match more.chars().next()? {
+            ']' => return Some(at + 1),
+            // A number sign before the bracket begins a comment.
+            '#' => return None,
+            '"' | '\'' => at += quoted_end(more)?,
+            other => at += other.len_utf8(),
+        }
+    }
+}
+
+fn constant(written: &str, name: &str, value: &str) -> Result<Constant, String> {
+    let primitive = Primitive::named(RosVersion::Two, written)
+        .ok_or_else(|| format!("a constant cannot be of type {written}"))?;
+    let value = match item(primitive, value)? {
+        Item::Text(text) => text.into(),
+        Item::Scalar(_) => value.to_owned(),
+    };
+    Ok(Constant {
+        name: name.to_owned(),
+        type_name: written.to_owned(),
+        value,
+    })
+}
+
+fn field(package: &str, written: &str, name: &str, value: &str) -> Result<ParsedField, String> {
+    let (bare, brackets) = written.split_at(written.find('[').unwrap_or(written.len()));
+    let (bare, text_bound) = match bare.split_once("<=") {
+        Some((text, bound)) if matches!(text, "string" | "wstring") => (text, Some(size(bound)?)),
+        Some(_) => return Err(format!("{bare} cannot be bounded")),
+        None => (bare, None),
+    };
+    let (arity, most) = parse_brackets(brackets)?;
+    let bounds = Bounds {
+        text: text_bound,
+        elements: most,
+    };
+    let primitive = Primitive::named(RosVersion::Two, bare);
+    let initial = match primitive {
+        _ if value.is_empty() => None,
+        None => {
+            return Err(format!(
+                "a field of type {bare} takes no value, got {value:?}"
+            ));
+        }
+        Some(primitive) => {
+            let initial = Initial::parse(primitive, arity != Arity::One, value)?;
+            check_initial(&initial, arity, bounds)?;
+            Some(initial)
+        }
+    };
+    Ok(ParsedField {
+        name: name.to_owned(),
+        type_name: match primitive {
+            Some(_) => bare.to_owned(),
+            None => resolve_name(package, bare)?,
+        },
+        arity,
+        bounds,
+        initial,
+    })
+}
+
+fn parse_brackets(brackets: &str) -> Result<(Arity, Option<u32>), String> {
+    let Some(inside) = brackets.strip_prefix('[') else {
+        return Ok((Arity::One, None));
+    };
+    let inside = inside
+        .strip_suffix(']')
+        .ok_or_else(|| format!("{brackets} is not an array suffix"))?;
+    Ok(match inside.strip_prefix("<=") {
+        Some(most) => (Arity::Variable, Some(size(most)?)),
+        None if inside.is_empty() => (Arity::Variable, None),
+        None => (Arity::Fixed(size(inside)?), None),
+    })
+}
+
+fn size(written: &str) -> Result<u32, String> {
+    let digits = written.bytes().all(|byte| byte.is_ascii_digit());
+    match written.parse::<u32>() {
+        Ok(size) if digits && (1..=MAX_MESSAGE_BYTES).contains(&(size as usize)) => Ok(size),
+        _ => Err(format!(
+            "a size of {written} is not a number from 1 to {MAX_MESSAGE_BYTES}"
+        )),
+    }
+}
+
+fn check_initial(initial: &Initial, arity: Arity, bounds: Bounds) -> Result<(), String> {
+    let found = initial.0.len();
+    match (arity, bounds.elements) {
+        (Arity::Fixed(count), _) if found != count as usize => {
+            return Err(format!("takes exactly {count} values, got {found}"));
+        }
+        (Arity::Variable, Some(most)) if found > most as usize => {
+            return Err(format!("takes at most {most} values, got {found}"));
+        }
+        _ => {}
+    }
+    for item in &initial.0 {
+        if let (Item::Text(text), Some(most)) = (item, bounds.text) {
+            let found = text.chars().count();
+            if found > most as usize {
+                return Err(format!("takes at most {most} characters, got {found}"));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// `package/Type` and bare names are of messages; a type that comes with a service or action has its folder in its name.
+fn resolve_name(package: &str, bare: &str) -> Result<String, String> {
+    if matches!(bare, "time" | "duration") {
+        let name = if bare == "time" { "Time" } else { "Duration" };
+        return Err(format!(
+            "ROS 2 has no {bare}, write builtin_interfaces/{name}"
+        ));
+    }
+    let parts: Vec<&str> = bare.split('/').collect();
+    let (package, kind, short) = match parts[..] {
+        [short] => (package, "msg", short),
+        [package, short] => (package, "msg", short),
+        [package, kind @ ("msg" | "srv" | "action"), short] => (package, kind, short),
+        _ => return Err(format!("{bare:?} is not a type name, write package/Type")),
+    };
+    check_identifier(package)?;
+    check_identifier(short)?;
+    Ok(format!("{package}/{kind}/{short}"))
+}
