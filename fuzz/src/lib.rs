@@ -10,6 +10,7 @@
 pub mod authority;
 pub mod codec;
 pub mod ros;
+pub mod ros2;
 pub mod rosbridge;
 
 /// What takes the fuzzer's bytes.
@@ -38,6 +39,10 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("ros_cbor", ros::cbor),
     ("ros_bytes", ros::bytes),
     ("ros_definition", ros::definition),
+    ("ros2_json", ros2::json),
+    ("ros2_cbor", ros2::cbor),
+    ("ros2_bytes", ros2::bytes),
+    ("ros2_definition", ros2::definition),
     ("ros_tcpros", ros::tcpros),
     ("ros_xmlrpc", ros::xmlrpc),
 ];

@@ -1,10 +1,12 @@
-//! ROS: definitions, serialized messages and their JSON and CBOR, TCPROS, XML-RPC.
+//! ROS: definitions, serialized messages and their JSON and CBOR, TCPROS, XML-RPC. Messages are of ROS 1 here; those
+//! of ROS 2 go the same ways.
 
 use std::sync::{Arc, LazyLock};
 
+use ::ros::bus::RosVersion;
 use ::ros::codec::{
-    self, CborOptions, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Time, cbor_item_len,
-    json_value_len,
+    self, CborOptions, CodecErrorKind, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Stamps,
+    Time, Value, cbor_item_len, json_value_len,
 };
 use ::ros::ros1::tcpros::{FrameReader, Header};
 use ::ros::ros1::xmlrpc::{parse_call, parse_response, print_call, print_response};
@@ -65,14 +67,21 @@ const FILL: FillOptions = FillOptions {
     max_bytes: MAX_BYTES,
 };
 
-fn choose(data: &[u8]) -> Option<(&'static MessageType, &[u8])> {
+fn choose<'a>(
+    types: &'a [Arc<MessageType>],
+    data: &'a [u8],
+) -> Option<(&'a MessageType, &'a [u8])> {
     let (first, rest) = data.split_first()?;
-    Some((&TYPES[usize::from(*first) % TYPES.len()], rest))
+    Some((&types[usize::from(*first) % types.len()], rest))
 }
 
 /// JSON for a message.
 pub fn json(data: &[u8]) {
-    let Some((message, text)) = choose(data) else {
+    json_of(&TYPES, data);
+}
+
+pub(crate) fn json_of(types: &[Arc<MessageType>], data: &[u8]) {
+    let Some((message, text)) = choose(types, data) else {
         return;
     };
     let length = json_value_len(text);
@@ -88,7 +97,11 @@ pub fn json(data: &[u8]) {
 
 /// CBOR for a message.
 pub fn cbor(data: &[u8]) {
-    let Some((message, item)) = choose(data) else {
+    cbor_of(&TYPES, data);
+}
+
+pub(crate) fn cbor_of(types: &[Arc<MessageType>], data: &[u8]) {
+    let Some((message, item)) = choose(types, data) else {
         return;
     };
     let length = cbor_item_len(item);
@@ -104,19 +117,28 @@ pub fn cbor(data: &[u8]) {
 
 /// A serialized message.
 pub fn bytes(data: &[u8]) {
-    let Some((message, bytes)) = choose(data) else {
+    bytes_of(&TYPES, data);
+}
+
+pub(crate) fn bytes_of(types: &[Arc<MessageType>], data: &[u8]) {
+    let Some((message, bytes)) = choose(types, data) else {
         return;
     };
     message_of(message, bytes);
 }
 
 fn message_of(message: &MessageType, bytes: &[u8]) {
+    if let Some(found) = Stamps::of(message).find(bytes) {
+        assert!(found.iter().all(|at| at + 8 <= bytes.len()));
+    }
+    let is_valid = codec::validate(message, bytes).is_ok();
+    let _ = Value::read(message, bytes);
     let (mut json, mut cbor) = (Vec::new(), Vec::new());
     let written = [
         codec::to_json(message, bytes, &mut json, &JSON).is_ok(),
         codec::to_cbor(message, bytes, &mut cbor, &CBOR).is_ok(),
     ];
-    if codec::validate(message, bytes).is_ok() {
+    if is_valid {
         // Texts grow by up to six bytes for one.
         if bytes.len() < MAX_BYTES / 32 {
             assert_eq!(written, [true, true]);
@@ -139,8 +161,21 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
     codec::to_cbor(message, bytes, &mut cbor, &CBOR).expect("CBOR is shorter than JSON");
     assert_eq!(cbor_item_len(&cbor).expect("it is CBOR"), cbor.len());
     let (mut from_json, mut from_cbor) = (Vec::new(), Vec::new());
-    codec::from_json(message, &json, &mut from_json, &FILL).expect("its own JSON");
-    codec::from_cbor(message, &cbor, &mut from_cbor, &FILL).expect("its own CBOR");
+    for read in [
+        codec::from_json(message, &json, &mut from_json, &FILL),
+        codec::from_cbor(message, &cbor, &mut from_cbor, &FILL),
+    ] {
+        match read.map_err(|error| error.kind) {
+            Ok(()) => {}
+            // Only writers keep to bounds; and what ROS 2 pads may make its messages longer than the JSON.
+            Err(CodecErrorKind::TooMany { .. } | CodecErrorKind::TooLarge(_))
+                if message.version() == RosVersion::Two =>
+            {
+                return;
+            }
+            Err(kind) => panic!("its own JSON or CBOR: {kind}"),
+        }
+    }
     // Compared as JSON: which NaN it was is not kept, nor which bytes were not UTF-8.
     for back in [from_json, from_cbor] {
         let mut again = Vec::new();
@@ -151,6 +186,10 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
 
 /// A definition, and after a zero byte a message of it.
 pub fn definition(data: &[u8]) {
+    definition_of(RosVersion::One, data);
+}
+
+pub(crate) fn definition_of(version: RosVersion, data: &[u8]) {
     let at = data
         .iter()
         .position(|byte| *byte == 0)
@@ -159,14 +198,14 @@ pub fn definition(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(text) else {
         return;
     };
-    let registry = Registry::new();
+    let registry = Registry::of(version);
     for kind in ["msg", "srv", "action"] {
         let _ = registry.insert(&format!("b/{kind}/X"), text);
     }
     let _ = (registry.service("b/X"), registry.action("b/X"));
-    if let Ok(message) = MessageType::from_full_text("b/X", text) {
-        let again = MessageType::from_full_text("b/X", message.full_text());
-        assert_eq!(again.expect("its own text").md5(), message.md5());
+    if let Ok(message) = MessageType::of_full_text(version, "b/X", text) {
+        let again = MessageType::of_full_text(version, "b/X", message.full_text());
+        assert_eq!(again.expect("its own text").digest(), message.digest());
         if message.min_size() < MAX_BYTES {
             codec::default_json(&message);
         }

@@ -1,5 +1,6 @@
 mod bad_input;
 mod cbor;
+mod cdr;
 mod items;
 mod json;
 mod property;

@@ -1,3 +1,5 @@
+mod ros2;
+
 use std::sync::Arc;
 
 use super::*;

@@ -1,9 +1,12 @@
-//! Random types, random messages of them, and random damage.
+//! Random types of either ROS, random messages of them, and random damage.
 
 use proptest::prelude::*;
 
 use super::*;
-use crate::schema::{Arity, Base, Field, Primitive};
+use crate::bus::RosVersion;
+use crate::schema::{Arity, Base, Primitive};
+
+const VERSIONS: [RosVersion; 2] = [RosVersion::One, RosVersion::Two];
 
 /// A source of choices that proptest can shrink: bytes, then zeros.
 struct Choices<'a>(std::slice::Iter<'a, u8>);
@@ -23,7 +26,7 @@ impl Choices<'_> {
 }
 
 /// A type `a/T0` made of random fields, some of them of types `a/T1`, `a/T2`.
-fn random_type(choices: &mut Choices<'_>) -> Arc<MessageType> {
+fn random_type(version: RosVersion, choices: &mut Choices<'_>) -> Arc<MessageType> {
     const TYPES: [&str; 17] = [
         "bool",
         "int8",
@@ -43,81 +46,173 @@ fn random_type(choices: &mut Choices<'_>) -> Arc<MessageType> {
         "duration",
         "std_msgs/Header",
     ];
-    let registry = Registry::new();
+    let two = version == RosVersion::Two;
+    let registry = Registry::of(version);
     for level in (0..3).rev() {
         let mut text = String::new();
         for index in 0..choices.below(7) {
             let pick = choices.below(TYPES.len() + 2 * (2 - level));
             let nested = format!("T{}", level + 1 + (pick % 2) % (3 - level).max(1));
             let nested = if level == 1 { "T2".to_owned() } else { nested };
-            let base = TYPES.get(pick).copied().unwrap_or(&nested);
-            let brackets = ["", "", "[]", "[3]", "[0]"][choices.below(5)];
+            let base = match TYPES.get(pick).copied().unwrap_or(&nested) {
+                "time" if two => "builtin_interfaces/Time",
+                "duration" if two => "builtin_interfaces/Duration",
+                "string" if two => ["string", "wstring", "string<=40"][choices.below(3)],
+                other => other,
+            };
+            let brackets = match two {
+                false => ["", "", "[]", "[3]", "[0]"][choices.below(5)],
+                true => ["", "", "[]", "[3]", "[<=5]"][choices.below(5)],
+            };
+            // What a client leaves out, a definition may say.
+            let value = match (two && choices.below(4) == 0, base, brackets) {
+                (true, "uint16" | "float64" | "string" | "wstring", "") => " 7",
+                (true, "int64" | "string<=40", "[]" | "[<=5]") => " [1, 2]",
+                _ => "",
+            };
             // Names out of alphabetical order: sorted keys are then out of order.
             let letter = char::from(b'z' - (index as u8 * 7 + level as u8) % 26);
-            text.push_str(&format!("{base}{brackets} {letter}{index}\n"));
+            text.push_str(&format!("{base}{brackets} {letter}{index}{value}\n"));
         }
         registry.insert(&format!("a/msg/T{level}"), &text).unwrap();
     }
     registry.message("a/T0").unwrap()
 }
 
-fn random_message(fields: &[Field], choices: &mut Choices<'_>, out: &mut Vec<u8>) {
-    for field in fields {
-        let count = match field.arity {
-            Arity::One => 1,
-            Arity::Fixed(count) => count as usize,
-            Arity::Variable => {
-                let count = choices.below(5);
-                out.extend_from_slice(&(count as u32).to_le_bytes());
-                count
-            }
+/// Writes messages without any of the codec's code.
+struct Writer {
+    out: Vec<u8>,
+    version: RosVersion,
+    big_endian: bool,
+    /// What pads, which is of any value.
+    padding: u8,
+}
+
+impl Writer {
+    fn new(version: RosVersion, big_endian: bool, padding: u8) -> Writer {
+        let out = match version {
+            RosVersion::One => Vec::new(),
+            RosVersion::Two => vec![0, u8::from(!big_endian), 0, 0],
         };
-        for _ in 0..count {
-            match &field.base {
-                Base::Message(inner) => random_message(inner.fields(), choices, out),
-                Base::Primitive(primitive) => random_value(*primitive, choices, out),
+        Writer {
+            out,
+            version,
+            big_endian,
+            padding,
+        }
+    }
+
+    /// A number, given little endian.
+    fn number(&mut self, bytes: &[u8]) {
+        // The header is four bytes, so that places count from four.
+        while self.version == RosVersion::Two && (self.out.len() + 4) % bytes.len() != 0 {
+            self.out.push(self.padding);
+        }
+        let begin = self.out.len();
+        self.out.extend_from_slice(bytes);
+        if self.big_endian {
+            self.out[begin..].reverse();
+        }
+    }
+
+    fn length(&mut self, length: usize) {
+        self.number(&(length as u32).to_le_bytes());
+    }
+
+    fn message(&mut self, message: &MessageType, choices: &mut Choices<'_>) {
+        for field in message.fields() {
+            let count = match field.arity {
+                Arity::One => 1,
+                Arity::Fixed(count) => count as usize,
+                Arity::Variable => {
+                    let count = choices.below(5);
+                    self.length(count);
+                    count
+                }
+            };
+            for _ in 0..count {
+                match &field.base {
+                    Base::Message(inner) => self.message(inner, choices),
+                    Base::Primitive(primitive) => self.value(*primitive, choices),
+                }
+            }
+        }
+        if self.version == RosVersion::Two && message.fields().is_empty() {
+            self.out.push(self.padding);
+        }
+    }
+
+    fn value(&mut self, primitive: Primitive, choices: &mut Choices<'_>) {
+        match primitive {
+            Primitive::Bool => self.number(&[choices.byte() & 1]),
+            // Finite or one NaN: which NaN it was is not kept. Of few digits, for serde_json rounds long ones its own way.
+            Primitive::Float32 => {
+                let value = match choices.below(8) {
+                    0 => f32::NAN,
+                    1 => f32::INFINITY,
+                    _ => (choices.word() as i16) as f32 / 64.0,
+                };
+                self.number(&value.to_le_bytes());
+            }
+            Primitive::Float64 => {
+                let value = match choices.below(8) {
+                    0 => f64::NAN,
+                    1 => f64::NEG_INFINITY,
+                    _ => (choices.word() as i16) as f64 / 1024.0,
+                };
+                self.number(&value.to_le_bytes());
+            }
+            Primitive::String | Primitive::Wstring => {
+                let text: String = (0..choices.below(12))
+                    .map(|_| ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.below(9)])
+                    .collect();
+                self.text(&text, primitive == Primitive::Wstring);
+            }
+            Primitive::Time | Primitive::Duration => {
+                self.number(&(choices.word() as u32).to_le_bytes());
+                self.number(&(choices.word() as u32).to_le_bytes());
+            }
+            _ => self.number(&choices.word().to_le_bytes()[..primitive.size()]),
+        }
+    }
+
+    fn text(&mut self, text: &str, wide: bool) {
+        match (self.version, wide) {
+            (RosVersion::One, _) => {
+                self.length(text.len());
+                self.out.extend_from_slice(text.as_bytes());
+            }
+            (RosVersion::Two, false) => {
+                self.length(text.len() + 1);
+                self.out.extend_from_slice(text.as_bytes());
+                self.out.push(0);
+            }
+            (RosVersion::Two, true) => {
+                let units: Vec<u16> = text.encode_utf16().collect();
+                self.length(units.len());
+                for unit in units {
+                    self.number(&u32::from(unit).to_le_bytes());
+                }
             }
         }
     }
 }
 
-fn random_value(primitive: Primitive, choices: &mut Choices<'_>, out: &mut Vec<u8>) {
-    match primitive {
-        Primitive::Bool => out.push(choices.byte() & 1),
-        // Finite or one NaN: which NaN it was is not kept. Of few digits, for serde_json rounds long ones its own way.
-        Primitive::Float32 => {
-            let value = match choices.below(8) {
-                0 => f32::NAN,
-                1 => f32::INFINITY,
-                _ => (choices.word() as i16) as f32 / 64.0,
-            };
-            out.extend_from_slice(&value.to_le_bytes());
-        }
-        Primitive::Float64 => {
-            let value = match choices.below(8) {
-                0 => f64::NAN,
-                1 => f64::NEG_INFINITY,
-                _ => (choices.word() as i16) as f64 / 1024.0,
-            };
-            out.extend_from_slice(&value.to_le_bytes());
-        }
-        Primitive::String => {
-            let text: String = (0..choices.below(12))
-                .map(|_| ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.below(9)])
-                .collect();
-            out.extend_from_slice(&(text.len() as u32).to_le_bytes());
-            out.extend_from_slice(text.as_bytes());
-        }
-        _ => out.extend_from_slice(&choices.word().to_le_bytes()[..primitive.size()]),
-    }
+fn random(version: RosVersion, choices: &[u8]) -> (Arc<MessageType>, Vec<u8>) {
+    random_of(version, choices, false, 0)
 }
 
-fn random(choices: &[u8]) -> (Arc<MessageType>, Vec<u8>) {
+fn random_of(
+    version: RosVersion,
+    choices: &[u8],
+    big_endian: bool,
+    padding: u8,
+) -> (Arc<MessageType>, Vec<u8>) {
     let mut choices = Choices(choices.iter());
-    let message = random_type(&mut choices);
-    let mut bytes = Vec::new();
-    random_message(message.fields(), &mut choices, &mut bytes);
-    (message, bytes)
+    let message = random_type(version, &mut choices);
+    let mut writer = Writer::new(version, big_endian, padding);
+    writer.message(&message, &mut choices);
+    (message, writer.out)
 }
 
 fn json_options() -> JsonOptions {
@@ -199,7 +294,8 @@ proptest! {
 
     #[test]
     fn json_and_cbor_give_back_what_they_were_made_of(choices in proptest::collection::vec(any::<u8>(), 0..400)) {
-        let (message, bytes) = random(&choices);
+        for version in VERSIONS {
+        let (message, bytes) = random(version, &choices);
         validate(&message, &bytes).unwrap();
 
         let mut json = Vec::new();
@@ -223,6 +319,46 @@ proptest! {
             prop_assert_eq!(&back, &bytes);
             prop_assert_eq!(cbor_item_len(&cbor).unwrap(), cbor.len());
         }
+        }
+    }
+
+    #[test]
+    fn both_orders_of_bytes_and_any_padding_say_the_same(
+        choices in proptest::collection::vec(any::<u8>(), 0..400),
+        padding in any::<u8>(),
+    ) {
+        let (message, bytes) = random(RosVersion::Two, &choices);
+        let (mut json, mut cbor) = (Vec::new(), Vec::new());
+        to_json(&message, &bytes, &mut json, &json_options()).unwrap();
+        to_cbor(&message, &bytes, &mut cbor, &CborOptions::default()).unwrap();
+        for big_endian in [false, true] {
+            let (message, mut other) = random_of(RosVersion::Two, &choices, big_endian, padding);
+            other.extend([padding; 3]);
+            let (mut again, mut cbor_again) = (Vec::new(), Vec::new());
+            to_json(&message, &other, &mut again, &json_options()).unwrap();
+            to_cbor(&message, &other, &mut cbor_again, &CborOptions::default()).unwrap();
+            prop_assert_eq!(&again, &json);
+            prop_assert_eq!(&cbor_again, &cbor);
+            prop_assert_eq!(Value::read(&message, &other).is_some(), true);
+        }
+    }
+
+    #[test]
+    fn the_default_message_is_what_an_empty_object_makes(choices in proptest::collection::vec(any::<u8>(), 0..100)) {
+        for version in VERSIONS {
+            let message = random_type(version, &mut Choices(choices.iter()));
+            let bytes = default_message(&message);
+            validate(&message, &bytes).unwrap();
+            let mut again = Vec::new();
+            let options = FillOptions { now: None, ..fill_options() };
+            from_json(&message, default_json(&message).as_bytes(), &mut again, &options).unwrap();
+            prop_assert_eq!(&again, &bytes);
+            if version == RosVersion::One {
+                prop_assert_eq!(bytes, vec![0; message.min_size()]);
+            } else {
+                prop_assert!(bytes.len() >= 4 + message.min_size());
+            }
+        }
     }
 
     #[test]
@@ -230,7 +366,8 @@ proptest! {
         choices in proptest::collection::vec(any::<u8>(), 0..300),
         edits in proptest::collection::vec(any::<(u16, u8, u8)>(), 1..6),
     ) {
-        let (message, mut bytes) = random(&choices);
+        for version in VERSIONS {
+        let (message, mut bytes) = random(version, &choices);
         let (mut json, mut cbor, mut back) = (Vec::new(), Vec::new(), Vec::new());
         to_json(&message, &bytes, &mut json, &json_options()).unwrap();
         to_cbor(&message, &bytes, &mut cbor, &CborOptions::default()).unwrap();
@@ -256,6 +393,8 @@ proptest! {
         prop_assert!(agrees(&valid, &written), "{valid:?}, yet JSON {written:?}");
         let written = to_cbor(&message, &bytes, &mut cbor, &CborOptions::default());
         prop_assert!(agrees(&valid, &written), "{valid:?}, yet CBOR {written:?}");
+        prop_assert!(Stamps::of(&message).find(&bytes).is_none_or(|found| found.iter().all(|at| at + 8 <= bytes.len())));
+        }
     }
 
     #[test]
@@ -263,14 +402,17 @@ proptest! {
         choices in proptest::collection::vec(any::<u8>(), 0..60),
         garbage in proptest::collection::vec(any::<u8>(), 0..200),
     ) {
-        let message = random_type(&mut Choices(choices.iter()));
+        for version in VERSIONS {
+        let message = random_type(version, &mut Choices(choices.iter()));
         let mut out = Vec::new();
         let _ = from_json(&message, &garbage, &mut out, &fill_options());
         let _ = from_cbor(&message, &garbage, &mut out, &fill_options());
         let _ = to_json(&message, &garbage, &mut out, &json_options());
+        let _ = Value::read(&message, &garbage);
         let _ = cbor_item_len(&garbage);
         let _ = json_value_len(&garbage);
         prop_assert!(out.len() <= 4 << 20);
+        }
     }
 
     #[test]

@@ -81,7 +81,7 @@ fn field(package: &str, written: &str, name: &str, value: &str) -> Result<Parsed
     let (bare, brackets) = written.split_at(written.find('[').unwrap_or(written.len()));
     let (bare, text_bound) = match bare.split_once("<=") {
         Some((text, bound)) if matches!(text, "string" | "wstring") => (text, Some(size(bound)?)),
-        Some(_) => return Err(format!("{bare} cannot be bounded")),
+        Some((text, _)) => return Err(format!("{text} cannot be bounded")),
         None => (bare, None),
     };
     let (arity, most) = parse_brackets(brackets)?;

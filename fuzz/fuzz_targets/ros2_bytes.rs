@@ -1,0 +1,3 @@
+//! A serialized message of ROS 2.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(ros2, bytes);

@@ -1,0 +1,75 @@
+//! Definitions of ROS 2, serialized messages and their JSON and CBOR.
+
+use std::sync::{Arc, LazyLock};
+
+use ::ros::bus::RosVersion;
+use ::ros::schema::{MessageType, Registry};
+
+use crate::ros::{bytes_of, cbor_of, definition_of, json_of};
+
+/// The types that the first byte of the input chooses from.
+static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
+    let registry = Registry::of(RosVersion::Two);
+    for (key, text) in [
+        ("a/msg/Text", "string data\nwstring wide\nuint8 last\n"),
+        (
+            "a/msg/Numbers",
+            "bool a\nint8 b\nuint8 c\nint16 d\nuint16 e\nint32 f\nuint32 g\nint64 h\nuint64 i\nfloat32 j\n\
+             float64 k\nbuiltin_interfaces/Time l\nbyte m\nbuiltin_interfaces/Duration n\n",
+        ),
+        (
+            "a/msg/Lists",
+            "bool[] a\nint8[] b\nuint8[] c\nchar[3] d\nint16[2] e\nuint32[] f\nint64[] g\nfloat32[] h\n\
+             float64[2] i\nstring[] j\nbuiltin_interfaces/Time[] k\nwstring[2] l\na/Nothing[] m\na/Text[2] n\n",
+        ),
+        ("a/msg/Nothing", ""),
+        (
+            "a/msg/Picture",
+            "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8[] data\n",
+        ),
+        (
+            "a/msg/Bounds",
+            "string<=4 a 'abc'\nint64[<=2] b [1, 2]\nwstring<=2[<=2] c\nfloat64 d 0.5\na/Nothing e\nbyte[<=3] f\n",
+        ),
+        (
+            "a/msg/Place",
+            "uint8 n 7\nstd_msgs/Header header\nfloat64 x\nstring name\n",
+        ),
+        (
+            "a/msg/Way",
+            "std_msgs/Header header\nPlace[] places\nint32[] indices\n",
+        ),
+    ] {
+        registry.insert(key, text).expect("these are definitions");
+    }
+    let names = [
+        "a/Text",
+        "a/Numbers",
+        "a/Lists",
+        "a/Picture",
+        "a/Bounds",
+        "a/Way",
+    ];
+    let find = |name| registry.message(name).expect("these were inserted");
+    names.into_iter().map(find).collect()
+});
+
+/// JSON for a message.
+pub fn json(data: &[u8]) {
+    json_of(&TYPES, data);
+}
+
+/// CBOR for a message.
+pub fn cbor(data: &[u8]) {
+    cbor_of(&TYPES, data);
+}
+
+/// A serialized message.
+pub fn bytes(data: &[u8]) {
+    bytes_of(&TYPES, data);
+}
+
+/// A definition, and after a zero byte a message of it.
+pub fn definition(data: &[u8]) {
+    definition_of(RosVersion::Two, data);
+}
