@@ -3,7 +3,7 @@
 use std::sync::{Arc, LazyLock};
 
 use ::ros::bus::RosVersion;
-use ::ros::schema::{MessageType, Registry};
+use ::ros::schema::{InterfaceFile, MessageType, Registry};
 
 use crate::ros::{bytes_of, cbor_of, definition_of, json_of};
 
@@ -69,7 +69,19 @@ pub fn bytes(data: &[u8]) {
     bytes_of(&TYPES, data);
 }
 
-/// A definition, and after a zero byte a message of it.
+/// A definition, and after a zero byte a message of it; or a file of the other forms that interfaces have.
 pub fn definition(data: &[u8]) {
+    if let Ok(text) = std::str::from_utf8(data) {
+        for key in ["b/msg/X", "b/srv/X", "b/action/X"] {
+            let files = [
+                InterfaceFile::read_idl(key, text),
+                InterfaceFile::read_description(key, text),
+            ];
+            for file in files.into_iter().flatten() {
+                let registry = file.registry().expect("its keys are names");
+                let _ = (registry.message(key), registry.service(key));
+            }
+        }
+    }
     definition_of(RosVersion::Two, data);
 }

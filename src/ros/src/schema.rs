@@ -11,6 +11,7 @@ mod action;
 mod derived;
 mod description;
 pub(crate) mod initial;
+mod interface_files;
 mod limits;
 mod parse;
 pub(crate) mod plan;
@@ -22,6 +23,7 @@ mod types;
 #[cfg(test)]
 mod tests;
 
+pub use interface_files::InterfaceFile;
 pub use limits::{MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TEXT_BYTES};
 pub use registry::Registry;
 pub use types::{

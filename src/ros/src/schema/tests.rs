@@ -1,3 +1,4 @@
+mod interface_files;
 mod ros2;
 
 use std::sync::Arc;

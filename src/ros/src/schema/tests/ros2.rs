@@ -435,8 +435,6 @@ fn errors_name_the_definition_and_the_line() {
             "{name}"
         );
     }
-    for (name, cycle) in [("a/A", "a/msg/A > a/msg/A")] {
-        let found = registry(&[("a/msg/A", "A a")]).message(name).unwrap_err();
-        assert_eq!(found, SchemaError::Cycle(cycle.into()));
-    }
+    let cycle = registry(&[("a/msg/A", "A a")]).message("a/A").unwrap_err();
+    assert_eq!(cycle, SchemaError::Cycle("a/msg/A > a/msg/A".into()));
 }

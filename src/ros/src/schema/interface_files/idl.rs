@@ -1,0 +1,329 @@
+//! OMG IDL 4.2, as much of it as rosidl reads: modules, structures, constants, `typedef` for arrays, annotations.
+
+mod tokens;
+
+use std::collections::BTreeMap;
+
+use crate::schema::interface_files::description::bracketed;
+use crate::schema::interface_files::idl::tokens::{Token, Tokens};
+use crate::schema::interface_files::{InterfaceFile, Line, assemble, quoted};
+use crate::schema::limits::MAX_NAME_BYTES;
+use crate::schema::{MAX_TEXT_BYTES, SchemaError};
+
+/// Package, kind, and the module of a structure's constants.
+const MOST_MODULES: usize = 3;
+
+pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
+    if idl.len() > MAX_TEXT_BYTES {
+        return Err(SchemaError::TooLarge {
+            name: key.to_owned(),
+            reason: format!("more than {MAX_TEXT_BYTES} bytes of IDL"),
+        });
+    }
+    let mut reader = Reader {
+        tokens: Tokens::new(idl),
+        scope: Vec::new(),
+        aliases: BTreeMap::new(),
+        constants: BTreeMap::new(),
+        structures: BTreeMap::new(),
+        written: 0,
+    };
+    reader.items().map_err(|reason| SchemaError::Syntax {
+        name: key.to_owned(),
+        line: reader.tokens.line(),
+        reason,
+    })?;
+    // Constants of a structure are in a module of its own, for IDL has none within.
+    let mut texts = reader.structures;
+    for (module, text) in reader.constants {
+        let owner = module.strip_suffix("_Constants").unwrap_or(&module);
+        if let Some(structure) = texts.get_mut(owner) {
+            structure.insert_str(0, &text);
+        }
+    }
+    let own = assemble(key, &texts)?;
+    let mut definitions: BTreeMap<String, String> = texts
+        .into_iter()
+        .filter(|(name, _)| name.split('/').nth(1) == Some("msg"))
+        .collect();
+    definitions.insert(key.to_owned(), own);
+    Ok(InterfaceFile {
+        definitions,
+        hashes: BTreeMap::new(),
+    })
+}
+
+struct Reader<'a> {
+    tokens: Tokens<'a>,
+    /// Modules around.
+    scope: Vec<String>,
+    /// `typedef`: type and brackets, by name.
+    aliases: BTreeMap<String, Line>,
+    /// Lines by module, `a/msg/A_Constants`.
+    constants: BTreeMap<String, String>,
+    /// Lines by structure, `a/msg/A`.
+    structures: BTreeMap<String, String>,
+    /// Bytes of lines: short names may stand for long ones.
+    written: usize,
+}
+
+impl Reader<'_> {
+    /// Up to the end, or the brace that closes a module.
+    fn items(&mut self) -> Result<(), String> {
+        loop {
+            match self.tokens.next()? {
+                None if self.scope.is_empty() => return Ok(()),
+                None => return Err("the text ends inside a module".to_owned()),
+                Some(Token::Mark('}')) if !self.scope.is_empty() => return Ok(()),
+                Some(Token::Mark(';')) => {}
+                Some(Token::Mark('@')) => drop(self.annotation()?),
+                Some(Token::Word("module")) => self.module()?,
+                Some(Token::Word("struct")) => self.structure()?,
+                Some(Token::Word("const")) => self.constant()?,
+                Some(Token::Word("typedef")) => {
+                    let alias = self.declaration()?;
+                    self.aliases.insert(alias.name.clone(), alias);
+                }
+                Some(other) => {
+                    return Err(format!("{other} begins nothing that messages are made of"));
+                }
+            }
+        }
+    }
+
+    fn module(&mut self) -> Result<(), String> {
+        let name = self.name()?.to_owned();
+        if self.scope.len() >= MOST_MODULES {
+            return Err(format!("modules nest deeper than {MOST_MODULES}"));
+        }
+        self.tokens.expect('{')?;
+        self.scope.push(name);
+        self.items()?;
+        self.scope.pop();
+        Ok(())
+    }
+
+    fn structure(&mut self) -> Result<(), String> {
+        let name = self.full_name()?;
+        self.tokens.expect('{')?;
+        let (mut text, mut value) = (String::new(), None);
+        while !self.tokens.skip('}')? {
+            if self.tokens.skip('@')? {
+                value = self.annotation()?.or(value);
+                continue;
+            }
+            let mut field = self.declaration()?;
+            if let Some(value) = value.take() {
+                field.value = value.written(&field);
+            }
+            if field.name != crate::schema::description::PLACEHOLDER {
+                self.append(&field, &mut text)?;
+            }
+        }
+        self.structures.insert(name, text);
+        Ok(())
+    }
+
+    fn constant(&mut self) -> Result<(), String> {
+        let mut constant = self.declarator()?;
+        self.tokens.expect('=')?;
+        let value = self.literal()?;
+        self.tokens.expect(';')?;
+        constant.value = format!("= {}", value.written(&constant));
+        // A bound says nothing of a constant.
+        let bare = constant.one.split("<=").next().unwrap_or_default();
+        constant.one = bare.to_owned();
+        let module = self.scope.join("/");
+        let mut text = self.constants.remove(&module).unwrap_or_default();
+        self.append(&constant, &mut text)?;
+        self.constants.insert(module, text);
+        Ok(())
+    }
+
+    fn append(&mut self, line: &Line, text: &mut String) -> Result<(), String> {
+        let before = text.len();
+        line.append_to(text)?;
+        self.written += text.len() - before;
+        if self.written > MAX_TEXT_BYTES {
+            return Err(format!("it defines more than {MAX_TEXT_BYTES} bytes"));
+        }
+        Ok(())
+    }
+
+    fn name(&mut self) -> Result<&str, String> {
+        let name = self.tokens.word()?;
+        match name.len() {
+            0..=MAX_NAME_BYTES => Ok(name),
+            _ => Err(format!("a name is longer than {MAX_NAME_BYTES} bytes")),
+        }
+    }
+
+    /// `TYPE NAME;` or `TYPE NAME[N];`
+    fn declaration(&mut self) -> Result<Line, String> {
+        let line = self.declarator()?;
+        self.tokens.expect(';')?;
+        Ok(line)
+    }
+
+    fn declarator(&mut self) -> Result<Line, String> {
+        let mut line = self.type_of(0)?;
+        line.name = self.name()?.to_owned();
+        if self.tokens.skip('[')? {
+            if !line.brackets.is_empty() {
+                return Err(format!("{} is an array of arrays", line.name));
+            }
+            line.brackets = format!("[{}]", self.name()?);
+            self.tokens.expect(']')?;
+        }
+        Ok(line)
+    }
+
+    fn full_name(&mut self) -> Result<String, String> {
+        let name = self.name()?.to_owned();
+        let outer = self.scope.iter().map(|module| format!("{module}/"));
+        Ok(outer.chain([name]).collect())
+    }
+
+    /// A type: its name in the language of `.msg`, and the brackets behind it.
+    fn type_of(&mut self, depth: usize) -> Result<Line, String> {
+        let first = self.name()?.to_owned();
+        let one = match &*first {
+            "sequence" => return self.sequence(depth),
+            "string" | "wstring" => {
+                let mut one = first;
+                if self.tokens.skip('<')? {
+                    one.push_str("<=");
+                    one.push_str(self.name()?);
+                    self.tokens.expect('>')?;
+                }
+                one
+            }
+            "boolean" => "bool".to_owned(),
+            "octet" => "byte".to_owned(),
+            "float" => "float32".to_owned(),
+            "double" => "float64".to_owned(),
+            "short" => "int16".to_owned(),
+            "long" if self.tokens.skip_word("double")? => {
+                return Err("messages have no long double".to_owned());
+            }
+            "long" => self.long("int")?,
+            "unsigned" => match self.tokens.word()? {
+                "short" => "uint16".to_owned(),
+                "long" => self.long("uint")?,
+                other => return Err(format!("unsigned {other} is not a type")),
+            },
+            "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64" | "uint64" => {
+                first
+            }
+            // What `.msg` calls char is uint8, and has another hash.
+            "char" | "wchar" | "fixed" | "any" | "enum" | "union" | "map" => {
+                return Err(format!("messages have no {first}"));
+            }
+            name => {
+                let mut path = vec![name.to_owned()];
+                while self.tokens.skip(':')? {
+                    self.tokens.expect(':')?;
+                    path.push(self.name()?.to_owned());
+                    if path.len() > MOST_MODULES {
+                        return Err(format!("{name} is in more than {MOST_MODULES} modules"));
+                    }
+                }
+                if let [name] = &path[..] {
+                    if let Some(alias) = self.aliases.get(name) {
+                        return Ok(alias.clone());
+                    }
+                }
+                match path.len() {
+                    1 => format!("{}/{}", self.scope.join("/"), path[0]),
+                    _ => path.join("/"),
+                }
+            }
+        };
+        Ok(Line {
+            one,
+            ..Line::default()
+        })
+    }
+
+    fn sequence(&mut self, depth: usize) -> Result<Line, String> {
+        self.tokens.expect('<')?;
+        if depth > 0 {
+            return Err("messages have no sequences of sequences".to_owned());
+        }
+        let mut line = self.type_of(depth + 1)?;
+        if !line.brackets.is_empty() {
+            return Err("messages have no sequences of arrays".to_owned());
+        }
+        line.brackets = match self.tokens.skip(',')? {
+            true => format!("[<={}]", self.name()?),
+            false => "[]".to_owned(),
+        };
+        self.tokens.expect('>')?;
+        Ok(line)
+    }
+
+    /// Behind a `long`: whether another follows.
+    fn long(&mut self, kind: &str) -> Result<String, String> {
+        let bits = if self.tokens.skip_word("long")? {
+            64
+        } else {
+            32
+        };
+        Ok(format!("{kind}{bits}"))
+    }
+
+    /// Behind the `@`; gives the value of a `default`.
+    fn annotation(&mut self) -> Result<Option<Literal>, String> {
+        let is_default = self.tokens.word()? == "default";
+        let mut value = None;
+        if !self.tokens.skip('(')? {
+            return Ok(None);
+        }
+        while !self.tokens.skip(')')? {
+            let name = self.tokens.word()?;
+            let is_value = is_default && name == "value";
+            self.tokens.expect('=')?;
+            let literal = self.literal()?;
+            if is_value {
+                value = Some(literal);
+            }
+            self.tokens.skip(',')?;
+        }
+        Ok(value)
+    }
+
+    fn literal(&mut self) -> Result<Literal, String> {
+        let mut text = match self.tokens.next()? {
+            Some(Token::Text(text)) => text,
+            Some(Token::Word(word)) => return Ok(Literal::Word(word.to_owned())),
+            other => return Err(format!("{} is no value", Token::or_end(other))),
+        };
+        // Texts one behind the other are one.
+        while let Some(more) = self.tokens.skip_text()? {
+            text.push_str(&more);
+        }
+        Ok(Literal::Text(text))
+    }
+}
+
+/// A value as it is written.
+enum Literal {
+    Text(String),
+    Word(String),
+}
+
+impl Literal {
+    /// As `.msg` writes it for a field.
+    fn written(&self, field: &Line) -> String {
+        match self {
+            Literal::Text(list) if !field.brackets.is_empty() => bracketed(list),
+            Literal::Text(text)
+                if matches!(field.one.split("<=").next(), Some("string" | "wstring")) =>
+            {
+                quoted(text)
+            }
+            Literal::Text(text) => text.clone(),
+            Literal::Word(word) => word.clone(),
+        }
+    }
+}
