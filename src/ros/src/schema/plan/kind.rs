@@ -1,0 +1,149 @@
+//! What fields hold, as the codec tells them apart.
+
+use std::sync::Arc;
+
+use crate::schema::{Arity, Base, Field, MessageType, Primitive};
+
+/// What one field holds.
+#[derive(Debug, Clone)]
+pub(crate) enum Kind {
+    Scalar(Scalar),
+    Text(Text),
+    /// `uint8` and `char` arrays.
+    Bytes(Count),
+    /// Arrays of all other scalars.
+    Scalars(Scalar, Count),
+    Texts(Text, Count),
+    Struct(Arc<MessageType>),
+    Structs(Arc<MessageType>, Count),
+}
+
+/// What a string holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Text {
+    /// Units of UTF-16, else bytes.
+    pub(crate) wide: bool,
+    /// Most characters.
+    pub(crate) most: usize,
+}
+
+/// Elements of an array.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Count {
+    Fixed(usize),
+    Variable,
+    /// At most so many.
+    Bounded(usize),
+}
+
+/// Values of a fixed size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Scalar {
+    Bool,
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    I64,
+    U64,
+    F32,
+    F64,
+    /// ROS 1's.
+    Time,
+    Duration,
+    /// `builtin_interfaces/msg/Time`.
+    Time2,
+    /// `builtin_interfaces/msg/Duration`.
+    Duration2,
+}
+
+impl Scalar {
+    pub(crate) fn size(self) -> usize {
+        match self {
+            Scalar::Bool | Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::I64 | Scalar::U64 | Scalar::F64 => 8,
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => 8,
+        }
+    }
+
+    /// Bytes of the largest number in it, of which its place is a multiple where values are aligned.
+    pub(crate) fn alignment(self) -> usize {
+        match self {
+            Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => 4,
+            other => other.size(),
+        }
+    }
+
+    fn of(primitive: Primitive) -> Option<Scalar> {
+        Some(match primitive {
+            Primitive::Bool => Scalar::Bool,
+            Primitive::Int8 => Scalar::I8,
+            Primitive::Uint8 => Scalar::U8,
+            Primitive::Int16 => Scalar::I16,
+            Primitive::Uint16 => Scalar::U16,
+            Primitive::Int32 => Scalar::I32,
+            Primitive::Uint32 => Scalar::U32,
+            Primitive::Int64 => Scalar::I64,
+            Primitive::Uint64 => Scalar::U64,
+            Primitive::Float32 => Scalar::F32,
+            Primitive::Float64 => Scalar::F64,
+            Primitive::Time => Scalar::Time,
+            Primitive::Duration => Scalar::Duration,
+            Primitive::String | Primitive::Wstring => return None,
+        })
+    }
+}
+
+impl Count {
+    /// No array of this kind has more elements.
+    pub(crate) fn most(self) -> usize {
+        match self {
+            Count::Fixed(count) | Count::Bounded(count) => count,
+            Count::Variable => usize::MAX,
+        }
+    }
+}
+
+impl Text {
+    fn of(field: &Field, primitive: Primitive) -> Text {
+        Text {
+            wide: primitive == Primitive::Wstring,
+            most: field.bounds.text.map_or(usize::MAX, |most| most as usize),
+        }
+    }
+}
+
+impl Kind {
+    pub(super) fn of(field: &Field) -> Kind {
+        let count = match field.arity {
+            Arity::One => None,
+            Arity::Fixed(count) => Some(Count::Fixed(count as usize)),
+            Arity::Variable => Some(match field.bounds.elements {
+                Some(most) => Count::Bounded(most as usize),
+                None => Count::Variable,
+            }),
+        };
+        if let Base::Message(message) = &field.base {
+            match (message.plan.scalar, count) {
+                (None, _) => {}
+                (Some(scalar), None) => return Kind::Scalar(scalar),
+                (Some(scalar), Some(count)) => return Kind::Scalars(scalar, count),
+            }
+        }
+        match (&field.base, count) {
+            (Base::Message(message), None) => Kind::Struct(message.clone()),
+            (Base::Message(message), Some(count)) => Kind::Structs(message.clone(), count),
+            (Base::Primitive(primitive), count) => match (Scalar::of(*primitive), count) {
+                (None, None) => Kind::Text(Text::of(field, *primitive)),
+                (None, Some(count)) => Kind::Texts(Text::of(field, *primitive), count),
+                (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
+                (Some(scalar), None) => Kind::Scalar(scalar),
+                (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
+            },
+        }
+    }
+}
