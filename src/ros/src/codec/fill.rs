@@ -278,7 +278,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
             return self.end_count(Count::Variable, begin, units);
         }
         self.input.text(self.out)?;
-        if text.most < usize::MAX {
+        if text.most < Text::UNBOUNDED {
             check_text(text, &String::from_utf8_lossy(&self.out[begin..]))?;
         }
         if L::TERMINATED {
@@ -402,12 +402,13 @@ fn too_many(count: Count, found: usize) -> Fault {
 }
 
 fn check_text(text: Text, written: &str) -> Result<(), Fault> {
-    if text.most == usize::MAX {
+    if text.most == Text::UNBOUNDED {
         return Ok(());
     }
+    let most = text.most as usize;
     match written.chars().count() {
-        found if found > text.most => Err(CodecErrorKind::TooMany {
-            most: text.most,
+        found if found > most => Err(CodecErrorKind::TooMany {
+            most,
             of: "characters",
             found,
         }

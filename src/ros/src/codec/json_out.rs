@@ -182,25 +182,24 @@ impl Json<'_> {
     /// Each ROS has its own names of the parts, and lets others be negative.
     #[inline]
     fn time(&mut self, scalar: Scalar, bytes: &[u8]) {
+        const OF_ONE: [&[u8]; 2] = [b"{\"secs\":", b",\"nsecs\":"];
+        const OF_TWO: [&[u8]; 2] = [b"{\"sec\":", b",\"nanosec\":"];
         let (secs, nsecs) = bytes.split_at(4);
-        let (secs, nsecs): ([u8; 4], [u8; 4]) = (array(secs), array(nsecs));
-        let two = matches!(scalar, Scalar::Time2 | Scalar::Duration2);
-        self.out.extend_from_slice(match two {
-            false => &b"{\"secs\":"[..],
-            true => b"{\"sec\":",
-        });
+        let (secs, nsecs) = (array(secs), array(nsecs));
+        let (signed, unsigned) = (i32::from_le_bytes, u32::from_le_bytes);
         match scalar {
-            Scalar::Time => self.integer(u32::from_le_bytes(secs)),
-            _ => self.integer(i32::from_le_bytes(secs)),
+            Scalar::Time => self.parts(OF_ONE, unsigned(secs), unsigned(nsecs)),
+            Scalar::Duration => self.parts(OF_ONE, signed(secs), signed(nsecs)),
+            _ => self.parts(OF_TWO, signed(secs), unsigned(nsecs)),
         }
-        self.out.extend_from_slice(match two {
-            false => &b",\"nsecs\":"[..],
-            true => b",\"nanosec\":",
-        });
-        match scalar {
-            Scalar::Duration => self.integer(i32::from_le_bytes(nsecs)),
-            _ => self.integer(u32::from_le_bytes(nsecs)),
-        }
+    }
+
+    #[inline]
+    fn parts(&mut self, names: [&[u8]; 2], secs: impl itoa::Integer, nsecs: impl itoa::Integer) {
+        self.out.extend_from_slice(names[0]);
+        self.integer(secs);
+        self.out.extend_from_slice(names[1]);
+        self.integer(nsecs);
         self.out.push(b'}');
     }
 }

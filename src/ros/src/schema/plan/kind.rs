@@ -23,8 +23,8 @@ pub(crate) enum Kind {
 pub(crate) struct Text {
     /// Units of UTF-16, else bytes.
     pub(crate) wide: bool,
-    /// Most characters.
-    pub(crate) most: usize,
+    /// Most characters; [`Text::UNBOUNDED`] where there is no bound.
+    pub(crate) most: u32,
 }
 
 /// Elements of an array.
@@ -109,10 +109,12 @@ impl Count {
 }
 
 impl Text {
+    pub(crate) const UNBOUNDED: u32 = u32::MAX;
+
     fn of(field: &Field, primitive: Primitive) -> Text {
         Text {
             wide: primitive == Primitive::Wstring,
-            most: field.bounds.text.map_or(usize::MAX, |most| most as usize),
+            most: field.bounds.text.unwrap_or(Self::UNBOUNDED),
         }
     }
 }
