@@ -120,12 +120,16 @@ impl Registry {
     /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are found by the service or action; those of ROS 2
     /// (`…_Request`) by their full name too (`package/srv/Type_Request`).
     pub fn message(&self, name: &str) -> Result<Arc<MessageType>, SchemaError> {
-        if let Some(found) = self.state.read().resolved_messages.get(name) {
+        let state = self.state.read();
+        if let Some(found) = state.resolved_messages.get(name) {
             return Ok(found.clone());
         }
-        let mut state = self.state.write();
         let name = state.message_name(name)?;
-        build_message(&mut state, &name)
+        if let Some(found) = state.resolved_messages.get(&name) {
+            return Ok(found.clone());
+        }
+        drop(state);
+        build_message(&mut self.state.write(), &name)
     }
 
     /// The service `package/Type` (or `package/srv/Type`).

@@ -277,7 +277,61 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::codec::from_json;
     use crate::schema::Registry;
+
+    #[test]
+    fn messages_of_ros_2_say_it_too() {
+        let registry = Registry::of(RosVersion::Two);
+        for (key, text) in [
+            (
+                "a/Picture",
+                "std_msgs/Header header\nwstring more\nuint16 height\nint64 width\nuint8[] data",
+            ),
+            (
+                "a/Info",
+                "builtin_interfaces/Time load\nfloat32 resolution\nuint32 width\nuint32 height",
+            ),
+            (
+                "a/Grid",
+                "std_msgs/Header header\nEmpty[2] none\nuint8 odd\nInfo info\nint8[] data",
+            ),
+            (
+                "a/Plain",
+                "std_msgs/Header header\nEmpty none\nfloat64[] skipped\nInfo info",
+            ),
+            ("a/Empty", ""),
+            (
+                "sensor_msgs/CompressedImage",
+                "std_msgs/Header header\nstring format\nuint8[] data",
+            ),
+        ] {
+            registry.insert(key, text).unwrap();
+        }
+        let find = |name: &str, json: &str| {
+            let message = registry.message(name).unwrap();
+            let mut bytes = Vec::new();
+            from_json(&message, json.as_bytes(), &mut bytes, &Default::default()).unwrap();
+            Extent::of(&message)?.find(&bytes)
+        };
+        let picture = r#"{"header": {"frame_id": "abc"}, "more": "é", "height": 48, "width": 64}"#;
+        assert_eq!(find("a/Picture", picture), Some((64, 48)));
+        let info = r#""info": {"width": 7, "height": 9}"#;
+        let plain = format!(r#"{{"header": {{"frame_id": "ab"}}, "skipped": [1, 2], {info}}}"#);
+        assert_eq!(find("a/Plain", &plain), Some((7, 9)));
+        // Beyond an array of messages it is not looked for.
+        assert_eq!(find("a/Grid", &format!("{{{info}}}")), None);
+        let png = "iVBORw0KGgoAAAANSUhEUgAAAAUAAAAG";
+        let compressed = format!(r#"{{"format": "png", "data": "{png}"}}"#);
+        assert_eq!(
+            find("sensor_msgs/CompressedImage", &compressed),
+            Some((5, 6))
+        );
+        // Big endian.
+        let info = registry.message("a/Info").unwrap();
+        let bytes = [0u32, 1, 2, 3, 640, 480].map(u32::to_be_bytes).concat();
+        assert_eq!(Extent::of(&info).unwrap().find(&bytes), Some((640, 480)));
+    }
 
     const HEADER: &str = "uint32 seq\ntime stamp\nstring frame_id";
     const DEFINITIONS: [(&str, &str); 9] = [

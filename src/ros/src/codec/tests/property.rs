@@ -86,6 +86,8 @@ struct Writer {
     big_endian: bool,
     /// What pads, which is of any value.
     padding: u8,
+    /// Where times were written.
+    times: Vec<usize>,
 }
 
 impl Writer {
@@ -99,6 +101,7 @@ impl Writer {
             version,
             big_endian,
             padding,
+            times: Vec::new(),
         }
     }
 
@@ -120,6 +123,9 @@ impl Writer {
     }
 
     fn message(&mut self, message: &MessageType, choices: &mut Choices<'_>) {
+        if message.name() == "builtin_interfaces/msg/Time" {
+            self.times.push(self.out.len().next_multiple_of(4));
+        }
         for field in message.fields() {
             let count = match field.arity {
                 Arity::One => 1,
@@ -169,6 +175,9 @@ impl Writer {
                 self.text(&text, primitive == Primitive::Wstring);
             }
             Primitive::Time | Primitive::Duration => {
+                if primitive == Primitive::Time {
+                    self.times.push(self.out.len());
+                }
                 self.number(&(choices.word() as u32).to_le_bytes());
                 self.number(&(choices.word() as u32).to_le_bytes());
             }
@@ -199,7 +208,8 @@ impl Writer {
 }
 
 fn random(version: RosVersion, choices: &[u8]) -> (Arc<MessageType>, Vec<u8>) {
-    random_of(version, choices, false, 0)
+    let (message, writer) = random_of(version, choices, false, 0);
+    (message, writer.out)
 }
 
 fn random_of(
@@ -207,12 +217,45 @@ fn random_of(
     choices: &[u8],
     big_endian: bool,
     padding: u8,
-) -> (Arc<MessageType>, Vec<u8>) {
+) -> (Arc<MessageType>, Writer) {
     let mut choices = Choices(choices.iter());
     let message = random_type(version, &mut choices);
     let mut writer = Writer::new(version, big_endian, padding);
     writer.message(&message, &mut choices);
-    (message, writer.out)
+    (message, writer)
+}
+
+/// Whether these are the same values, bytes as text left out.
+fn is_same(value: &Value<'_>, json: &serde_json::Value) -> bool {
+    use serde_json::Value as Json;
+    match (value, json) {
+        (Value::Number(number), Json::Bool(json)) => *number == f64::from(u8::from(*json)),
+        // Integers are rounded, singles are written shortly.
+        (Value::Number(number), Json::Number(json)) => json
+            .as_f64()
+            .is_some_and(|json| json == *number || json as f32 == *number as f32),
+        (Value::Number(number), Json::String(_)) => !number.is_finite(),
+        (Value::Text(_), Json::String(json)) => value.text().as_ref() == Some(json),
+        (Value::Time(time), Json::Object(json)) => {
+            let part = |names: [&str; 2]| {
+                let part = names.into_iter().find_map(|name| json.get(name))?;
+                part.as_i64().map(|part| part as u32)
+            };
+            let parts = (part(["secs", "sec"]), part(["nsecs", "nanosec"]));
+            parts == (Some(time.secs), Some(time.nsecs))
+        }
+        (Value::List(_), Json::String(_)) => true,
+        (Value::List(list), Json::Array(json)) => {
+            list.len() == json.len() && list.iter().zip(json).all(|(a, b)| is_same(a, b))
+        }
+        (Value::Message(fields), Json::Object(json)) => {
+            let same = |(name, value): &(&str, Value<'_>)| {
+                json.get(*name).is_some_and(|json| is_same(value, json))
+            };
+            fields.len() == json.len() && fields.iter().all(same)
+        }
+        _ => false,
+    }
 }
 
 fn json_options() -> JsonOptions {
@@ -332,14 +375,35 @@ proptest! {
         to_json(&message, &bytes, &mut json, &json_options()).unwrap();
         to_cbor(&message, &bytes, &mut cbor, &CborOptions::default()).unwrap();
         for big_endian in [false, true] {
-            let (message, mut other) = random_of(RosVersion::Two, &choices, big_endian, padding);
+            let (message, writer) = random_of(RosVersion::Two, &choices, big_endian, padding);
+            let mut other = writer.out;
             other.extend([padding; 3]);
             let (mut again, mut cbor_again) = (Vec::new(), Vec::new());
             to_json(&message, &other, &mut again, &json_options()).unwrap();
             to_cbor(&message, &other, &mut cbor_again, &CborOptions::default()).unwrap();
             prop_assert_eq!(&again, &json);
             prop_assert_eq!(&cbor_again, &cbor);
-            prop_assert_eq!(Value::read(&message, &other).is_some(), true);
+        }
+    }
+
+    #[test]
+    fn values_and_stamps_are_where_the_writer_put_them(
+        choices in proptest::collection::vec(any::<u8>(), 0..400),
+        padding in any::<u8>(),
+    ) {
+        for (version, big_endian) in [(RosVersion::One, false), (RosVersion::Two, false), (RosVersion::Two, true)] {
+            let (message, writer) = random_of(version, &choices, big_endian, padding);
+            let bytes = writer.out;
+            let mut json = Vec::new();
+            to_json(&message, &bytes, &mut json, &json_options()).unwrap();
+            let json = serde_json::from_slice(&json).unwrap();
+            let value = Value::read(&message, &bytes);
+            // More elements without any bytes than bytes follow are not looked at: ROS 1's alone have none.
+            let same = value.as_ref().map_or(version == RosVersion::One, |value| is_same(value, &json));
+            prop_assert!(same, "{:?} is not {}", value, json);
+            // Stamps are rewritten in place, little endian.
+            let stamps = (!big_endian).then_some(writer.times);
+            prop_assert_eq!(Stamps::of(&message).find(&bytes), stamps);
         }
     }
 
