@@ -1,7 +1,10 @@
 //! The packages that are evaluated, the services made of them, and the recordings that they are asked with.
 
+mod packages;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use sha2::{Digest, Sha256};
@@ -11,119 +14,26 @@ use support::site::{image_config, in_image};
 use tempfile::TempDir;
 
 use crate::robot::{Node, Pace, Plan};
+use crate::stereo;
 use crate::weights;
+use crate::{attempts, deadline};
+
+pub use packages::{
+    ALL, DETECTOR, DISPARITY, Example, GRAPH_SLAM, Input, LASER_SLAM, LASER_SLAM_SIMULATED, Origin,
+    PEOPLE,
+};
+use packages::{DATA, DRIVE, SIMULATED, VIDEO};
 
 /// Where packages that were compiled are, in images.
-const INSTALLED: &str = "/opt/cloudroid/install/lib";
+const COMPILED: &str = "/opt/cloudroid/install/lib";
+/// Where those of Debian are.
+const PACKAGED: &str = "/usr/lib";
 /// Seconds after which a request counts as not answered.
 const GIVE_UP: f64 = 30.0;
+/// For making one recording.
+const CONVERTS: Duration = Duration::from_secs(300);
 /// The file that the converter writes.
 const BAG: &str = "recording.bag";
-/// Recordings of MRPT, of Debian's mrpt-common.
-const DATA: &str = "/usr/share/mrpt/datasets";
-/// A real drive of 76 m through a floor of a faculty, with a SICK laser.
-const DRIVE: &str = "2006-01ENE-21-SENA_Telecom Faculty_one_loop_only.rawlog";
-
-/// Pedestrians, of Debian's opencv-doc.
-const VIDEO: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
-
-/// A package below `examples/`, and what it speaks.
-#[derive(Debug, Clone, Copy)]
-pub struct Example {
-    /// Of its directory, the package and the service.
-    pub name: &'static str,
-    /// Of which published package it stands in.
-    pub stands_for: &'static str,
-    /// Its node.
-    pub executable: &'static str,
-    /// The topic whose messages it is asked by.
-    pub request: &'static str,
-    /// The topic of its answers.
-    pub answer: &'static str,
-    /// The topic on which it tells how long it took.
-    pub timing: &'static str,
-    /// The topic of its map.
-    pub map: Option<&'static str>,
-    /// Parameters of its node.
-    pub parameters: &'static [&'static str],
-    /// Lasers, or pictures.
-    pub input: Input,
-    /// Requests of one run.
-    pub requests: usize,
-}
-
-/// What a package is asked with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Input {
-    /// A robot's drive: scans and odometry.
-    Drive,
-    /// Pedestrians.
-    Pictures,
-}
-
-impl Input {
-    /// Whether the files that it is made of are there, so that nothing is built for a recording that cannot be had.
-    ///
-    /// # Errors
-    /// Says which is missing, and which package brings it.
-    pub fn is_there(self) -> Result<()> {
-        let (file, package) = match self {
-            Self::Drive => (Path::new(DATA).join(DRIVE), "mrpt-common"),
-            Self::Pictures => (PathBuf::from(VIDEO), "opencv-doc"),
-        };
-        ensure!(
-            file.exists(),
-            "{} is missing; it comes with Debian's {package}: apt-get install {package}",
-            file.display()
-        );
-        Ok(())
-    }
-}
-
-/// Scans are matched with the map that was made of those before.
-pub const LASER_SLAM: Example = Example {
-    name: "laser_slam",
-    stands_for: "RGBD-SLAM",
-    executable: "laser_slam_node",
-    request: "/scan",
-    answer: "/laser_slam/pose",
-    timing: "/laser_slam/timing",
-    map: Some("/map"),
-    parameters: &["_laser_x:=0.78"],
-    input: Input::Drive,
-    requests: 150,
-};
-
-/// Each scan is matched with all earlier ones nearby, and the graph of all poses is made to agree.
-pub const GRAPH_SLAM: Example = Example {
-    name: "graph_slam",
-    stands_for: "RTAB-Map",
-    executable: "graph_slam_node",
-    request: "/scan",
-    answer: "/graph_slam/pose",
-    timing: "/graph_slam/timing",
-    map: None,
-    parameters: &["_laser_x:=0.78"],
-    input: Input::Drive,
-    requests: 150,
-};
-
-/// A neural network looks for objects in pictures.
-pub const DETECTOR: Example = Example {
-    name: "object_detector",
-    stands_for: "SSD",
-    executable: "object_detector_node",
-    request: "/image",
-    answer: "/object_detector/detections",
-    timing: "/object_detector/timing",
-    map: None,
-    parameters: &[],
-    input: Input::Pictures,
-    requests: 40,
-};
-
-/// All of them, as the published figures have them.
-pub const ALL: [Example; 3] = [LASER_SLAM, GRAPH_SLAM, DETECTOR];
 
 /// Where an example answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -147,7 +57,7 @@ impl<'a> Workshop<'a> {
         Self { daemon, place }
     }
 
-    /// Publishes an example, unless that was done before.
+    /// Publishes an example, unless that was done before or has failed before.
     pub fn publishes(&self, example: &Example) -> Result<()> {
         let services = self.daemon.deployer().asks(&["services"])?;
         let known = services
@@ -156,26 +66,36 @@ impl<'a> Workshop<'a> {
         if known {
             return Ok(());
         }
+        attempts::once(example.name, || self.pushes(example))
+    }
+
+    fn pushes(&self, example: &Example) -> Result<()> {
         eprintln!(
             "pushing {}: the first time takes some minutes",
             example.name
         );
         example.input.is_there()?;
-        let package = binaries::checkout().join("examples").join(example.name);
-        if example.name == DETECTOR.name {
-            weights::put_into(&package)?;
+        let mut push = vec!["push".to_owned()];
+        match example.origin {
+            Origin::Checkout => {
+                let package = binaries::checkout().join("examples").join(example.name);
+                if example.name == DETECTOR.name {
+                    weights::put_into(&package)?;
+                }
+                push.push(package.to_str().context("a path of UTF-8")?.to_owned());
+            }
+            Origin::Debian => {
+                push.extend(["--apt", example.name].map(str::to_owned));
+                // What it says is learned from a start of it.
+                for parameter in example.parameters {
+                    let words = parameter.trim_start_matches('_').replace(":=", "=");
+                    push.extend(["--param".to_owned(), words]);
+                }
+            }
         }
-        let package = package.to_str().context("a path of UTF-8")?;
-        let push = [
-            "push",
-            package,
-            "--node",
-            example.executable,
-            "--cpus",
-            "1",
-            "--memory",
-            "2G",
-        ];
+        let limits = ["--node", example.executable, "--cpus", "1", "--memory"];
+        push.extend(limits.into_iter().chain(["2G"]).map(str::to_owned));
+        let push: Vec<&str> = push.iter().map(String::as_str).collect();
         self.daemon.deployer().types(&push)?.succeeded()?;
         Ok(())
     }
@@ -189,7 +109,11 @@ impl<'a> Workshop<'a> {
 
     /// What the robot does, as one request after the other.
     pub fn plan(&self, example: &Example, at: Where, directory: &Path) -> Result<Plan> {
-        let mut argv = vec![format!("__name:={}", example.name)];
+        let (name, installed) = match example.origin {
+            Origin::Checkout => (example.name, COMPILED),
+            Origin::Debian => (example.executable, PACKAGED),
+        };
+        let mut argv = vec![format!("__name:={name}")];
         argv.extend(example.parameters.iter().map(|word| (*word).to_owned()));
         let node = match at {
             Where::Native => {
@@ -205,7 +129,7 @@ impl<'a> Workshop<'a> {
                     })
                     .collect();
                 words.push(format!(
-                    "{INSTALLED}/{}/{}",
+                    "{installed}/{}/{}",
                     example.name, example.executable
                 ));
                 words.extend(argv);
@@ -230,12 +154,12 @@ impl<'a> Workshop<'a> {
             request: example.request.to_owned(),
             left_out: vec!["/ground_truth".to_owned()],
             besides: match example.input {
-                Input::Drive => vec!["/odom".to_owned()],
-                Input::Pictures => Vec::new(),
+                Input::Drive | Input::Simulated => vec!["/odom".to_owned()],
+                Input::Pictures | Input::Stereo => Vec::new(),
             },
             answer: example.answer.to_owned(),
-            tells_pose: example.input == Input::Drive,
-            timing: Some(example.timing.to_owned()),
+            tells_pose: matches!(example.input, Input::Drive | Input::Simulated),
+            timing: example.timing.map(str::to_owned),
             map: example.map.map(str::to_owned),
             pace: Pace::OneByOne,
             every: 1,
@@ -250,26 +174,30 @@ impl<'a> Workshop<'a> {
     pub fn recording(&self, input: Input) -> Result<PathBuf> {
         let path = self.place.join(match input {
             Input::Drive => "drive.bag",
+            Input::Simulated => "simulated.bag",
             Input::Pictures => "pedestrians.raw",
+            Input::Stereo => "plant.stereo",
         });
         if !path.exists() {
             let half = path.with_extension("half");
             match input {
-                Input::Drive => self.drive(&half)?,
+                Input::Drive => self.drive(DRIVE, &half)?,
+                Input::Simulated => self.drive(SIMULATED, &half)?,
                 Input::Pictures => pictures(&half)?,
+                Input::Stereo => stereo::write(&half)?,
             }
             std::fs::rename(half, &path)?;
         }
         Ok(path)
     }
 
-    /// MRPT's own recording as a rosbag file: the converter is a program of the example package.
-    fn drive(&self, to: &Path) -> Result<()> {
+    /// A recording of MRPT as a rosbag file: the converter is a program of the example package.
+    fn drive(&self, rawlog: &str, to: &Path) -> Result<()> {
         self.publishes(&LASER_SLAM)?;
         let directory = self.directory()?;
         let root = directory.path().join("root");
         let script = in_image(self.daemon, LASER_SLAM.name, &root)?;
-        let program = format!("{INSTALLED}/{}/rawlog_to_bag", LASER_SLAM.name);
+        let program = format!("{COMPILED}/{}/rawlog_to_bag", LASER_SLAM.name);
         // What the converter reads and writes is on this machine.
         let bind = format!(
             "mount --bind {} {root}/mnt && mount --bind {DATA} {root}/media && exec chroot",
@@ -277,10 +205,11 @@ impl<'a> Workshop<'a> {
             root = root.display()
         );
         let script = script.replace("exec chroot", &bind);
-        let output = Command::new("unshare")
+        let mut command = Command::new("unshare");
+        command
             .args(["--mount", "sh", "-c", &script, "sh", &program])
-            .args([format!("/mnt/{BAG}"), format!("/media/{DRIVE}")])
-            .output()?;
+            .args([format!("/mnt/{BAG}"), format!("/media/{rawlog}")]);
+        let output = deadline::output(&mut command, CONVERTS)?;
         ensure!(
             output.status.success(),
             "the recording of MRPT could not be converted: {}",
@@ -294,9 +223,13 @@ impl<'a> Workshop<'a> {
 /// What the packages are made of (SHA-256), so that runs of other ones are not taken for runs of these.
 pub fn fingerprint() -> Result<String> {
     let mut files = Vec::new();
-    let mut pending = vec![binaries::checkout().join("examples")];
+    let directories = ["examples", "eval/packages", "tests/packages/receipts_py"];
+    let mut pending = directories
+        .map(|name| binaries::checkout().join(name))
+        .to_vec();
     while let Some(directory) = pending.pop() {
-        for entry in std::fs::read_dir(&directory)? {
+        let entries = std::fs::read_dir(&directory);
+        for entry in entries.with_context(|| directory.display().to_string())? {
             let path = entry?.path();
             if path.is_dir() {
                 pending.push(path);
@@ -319,7 +252,7 @@ pub fn fingerprint() -> Result<String> {
 
 /// Pedestrians of opencv-doc, 640x480, bgr8, one after the other.
 fn pictures(to: &Path) -> Result<()> {
-    let status = Command::new("ffmpeg")
+    let mut child = Command::new("ffmpeg")
         .args(["-v", "error", "-i", VIDEO, "-vf", "scale=640:480"])
         .args([
             "-frames:v",
@@ -331,8 +264,9 @@ fn pictures(to: &Path) -> Result<()> {
             "-y",
         ])
         .arg(to)
-        .status()
+        .spawn()
         .context("ffmpeg")?;
+    let status = deadline::ends(&mut child, "ffmpeg", CONVERTS)?;
     ensure!(status.success(), "ffmpeg ended with {status}");
     Ok(())
 }

@@ -28,6 +28,7 @@ pub mod report;
 pub mod robot;
 pub mod section;
 pub mod statistics;
+pub mod stereo;
 pub mod stream;
 pub mod sweep;
 pub mod trace;

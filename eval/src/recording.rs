@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use bytes::{Buf, Bytes};
 use ros::bag::{self, Recorded};
 
-use crate::stream;
+use crate::{stereo, stream};
 
 /// Of pictures.
 const SIZE: (u32, u32) = (640, 480);
@@ -35,8 +35,8 @@ pub struct Step<'a> {
 }
 
 impl Recording {
-    /// Reads a rosbag file that is not compressed, a file of [`stream`] that ends with `.messages`, or a file that ends with `.raw`: pictures
-    /// of 640x480, bgr8, one after the other, ten a second.
+    /// Reads a rosbag file that is not compressed, a file of [`stream`] that ends with `.messages`, one of [`stereo`] that ends with
+    /// `.stereo`, or a file that ends with `.raw`: pictures of 640x480, bgr8, one after the other, ten a second.
     pub fn read(path: &Path) -> Result<Self> {
         let named = || path.display().to_string();
         let file = Bytes::from(std::fs::read(path).with_context(named)?);
@@ -45,6 +45,10 @@ impl Recording {
         }
         if path.extension().is_some_and(|ending| ending == "messages") {
             let messages = stream::read(&file).with_context(named)?;
+            return Ok(Self { messages });
+        }
+        if path.extension().is_some_and(|ending| ending == "stereo") {
+            let messages = stereo::read(&file);
             return Ok(Self { messages });
         }
         let mut messages = bag::read(&file, usize::MAX).with_context(named)?;

@@ -1,6 +1,7 @@
 //! What runs in a robot's place: a ROS Master, the robot's own node, which plays a recording and hears the answers, and the package as it is
 //! installed there or its stub.
 
+mod boxes;
 mod carried;
 mod rate;
 
@@ -522,6 +523,7 @@ fn number_of(message: &Message) -> Option<u32> {
 fn answered(request: &mut Request, message: &Message, after: Duration) {
     request.response = Some(after.as_secs_f64());
     request.digest = Some(digest(&message.bytes));
+    request.boxes = boxes::digest(message);
     request.pose = pose(&message.bytes);
 }
 

@@ -17,6 +17,9 @@ pub struct Request {
     pub pose: Option<[f64; 3]>,
     /// Of the answer without its header's sequence number; equal for equal answers.
     pub digest: Option<u64>,
+    /// The same of an answer that is a list of boxes, in whatever order they are.
+    #[serde(default)]
+    pub boxes: Option<u64>,
     /// Bytes of packets that had left the robot and had come to it when the answer was there, since its place was made.
     #[serde(default)]
     pub carried: Option<[u64; 2]>,
@@ -89,9 +92,17 @@ impl Trace {
         self.responses().len()
     }
 
-    /// Of the answers that tell them.
-    pub fn phases(&self) -> Vec<Phases> {
-        self.requests.iter().filter_map(|one| one.phases).collect()
+    /// Bytes of packets for each request, to the server and back, without the first `from` requests: counted from one answer to the last
+    /// one. None without counters, or where too few were answered.
+    pub fn carried_each(&self, from: usize) -> Option<[f64; 2]> {
+        let known = |(index, request): (usize, &Request)| Some((index, request.carried?));
+        let all: Vec<(usize, [u64; 2])> =
+            self.requests.iter().enumerate().filter_map(known).collect();
+        let first = all.iter().rfind(|(index, _)| *index < from)?;
+        let last = all.last().filter(|last| last.0 >= from)?;
+        let requests = (last.0 - first.0) as f64;
+        let bytes = |way: usize| last.1[way].checked_sub(first.1[way]);
+        Some([bytes(0)? as f64 / requests, bytes(1)? as f64 / requests])
     }
 
     /// Estimated positions: seconds of the recording, x and y in metres.
