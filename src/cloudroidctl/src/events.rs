@@ -1,5 +1,6 @@
 //! `events`: the daemon's journal.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use api::{Event, Level};
@@ -44,6 +45,12 @@ impl Events {
         }
         let path = format!("/api/v1/events?{}", self.query(0, self.tail));
         let events: Vec<Event> = client.get(&path).await?;
+        if let (true, Some(kind)) = (events.is_empty(), &self.kind) {
+            let all: Vec<Event> = client
+                .get(&format!("/api/v1/events?since=0&limit={ALL}"))
+                .await?;
+            output::complain(&nothing_of(kind, &all));
+        }
         match format {
             Format::Json => output::json(&events),
             Format::Table => events.iter().try_for_each(print),
@@ -133,6 +140,18 @@ fn in_a_line(event: &Event) -> String {
     format!("{time} {mark} {kind:<18} {}", event.message)
 }
 
+/// Words about a kind of which nothing is told; it may be misspelt.
+fn nothing_of(kind: &str, all: &[Event]) -> String {
+    let kinds: BTreeSet<&str> = all.iter().map(|event| event.kind.as_str()).collect();
+    match kinds.contains(kind) {
+        true => format!("no event of kind {kind} is told of that"),
+        false => format!(
+            "no event of kind {kind} is in the journal; there are: {}; docs/operators.md names all",
+            kinds.into_iter().collect::<Vec<_>>().join(", ")
+        ),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use clap::Parser;
@@ -172,6 +191,10 @@ mod tests {
             robot: None,
             message: "it hangs".into(),
         };
+        let unknown = nothing_of("node-hnug", std::slice::from_ref(&event));
+        assert!(unknown.contains("there are: node-hung;"), "{unknown}");
+        let known = nothing_of("node-hung", std::slice::from_ref(&event));
+        assert!(!known.contains("there are"), "{known}");
         assert_eq!(
             in_a_line(&event),
             "00:00:00.000 ! node-hung          it hangs"

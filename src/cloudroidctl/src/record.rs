@@ -62,6 +62,11 @@ impl Record {
         // What came before is kept, whatever has ended it.
         let summary = recorder.writer.finish()?;
         told(&summary, begun.elapsed(), format)?;
+        if recorder.last == 0 {
+            output::complain(&format!(
+                "none of the wanted topics was published in {servant}; see what is there with: cloudroidctl services NAME"
+            ));
+        }
         ended
     }
 }
