@@ -26,16 +26,18 @@ impl Recordings {
     fn new() -> anyhow::Result<Recordings> {
         let machine = Machine::new()?;
         let place = world().directory("pictures")?;
-        let raw = place.path().join("raw");
-        run(Command::new("ffmpeg")
-            .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", "5"])
-            .args(["-s", "640x480", "-pix_fmt", "rgb24", "-f", "rawvideo"])
-            .arg(&raw))?
-        .succeeded()?;
-        machine.puts(&raw, "/root/raw", 0o644)?;
+        for (name, frames, size) in [("raw", "5", "640x480"), ("raw_large", "2", "768x576")] {
+            let raw = place.path().join(name);
+            run(Command::new("ffmpeg")
+                .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", frames])
+                .args(["-s", size, "-pix_fmt", "rgb24", "-f", "rawvideo"])
+                .arg(&raw))?
+            .succeeded()?;
+            machine.puts(&raw, &format!("/root/{name}"), 0o644)?;
+        }
         let records = r#"
 import rosbag, rospy, struct
-from std_msgs.msg import Int32, String
+from std_msgs.msg import Float64, Int32, String
 
 class Image:
     """What the machine has no package of."""
@@ -43,15 +45,22 @@ class Image:
     _md5sum = "060021388200f6f0f447d0fcd9c64743"
     _full_text = "Header header"
 
-def picture(number, pixels):
+def picture(number, pixels, width=640, height=480):
     text = lambda words: struct.pack("<I", len(words)) + words
-    return (struct.pack("<III", number, 1000, number * 100000000) + text(b"camera") + struct.pack("<II", 480, 640)
-        + text(b"rgb8") + struct.pack("<BI", 0, 640 * 3) + text(pixels))
+    return (struct.pack("<III", number, 1000, number * 100000000) + text(b"camera") + struct.pack("<II", height, width)
+        + text(b"rgb8") + struct.pack("<BI", 0, width * 3) + text(pixels))
 
 with open("/root/raw", "rb") as file, rosbag.Bag("/root/people.bag", "w") as bag:
     for number in range(5):
         message = (Image._type, picture(number, file.read(640 * 480 * 3)), Image._md5sum, 0, Image)
         bag.write("/camera", message, rospy.Time(1000, number * 100000000), raw=True)
+with open("/root/raw_large", "rb") as file, rosbag.Bag("/root/large.bag", "w") as bag:
+    for number in range(2):
+        pixels = file.read(768 * 576 * 3)
+        message = (Image._type, picture(number, pixels, 768, 576), Image._md5sum, 0, Image)
+        bag.write("/camera", message, rospy.Time(1000, number * 100000000), raw=True)
+with rosbag.Bag("/root/other.bag", "w") as bag:
+    bag.write("/teller/say", Float64(1), rospy.Time(1000, 0))
 with rosbag.Bag("/root/words.bag", "w") as bag:
     for number in range(12):
         bag.write("/chatter", String("word %d" % number), rospy.Time(1000, number * 50000000))
@@ -135,12 +144,17 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
         "{found:#}"
     );
     let part = |name: &str| number(&found, &format!("/outsourced/phases/{name}"));
-    let parts = part("up")? + part("transport")? + part("compute")? + part("down")?;
     let median = number(&found, "/outsourced/rrt/p50")?;
-    ensure!(
-        (parts - median).abs() < 1e-6,
-        "{parts} is not {median}: {found:#}"
-    );
+    // Two runs: where nothing is over, nothing is said.
+    if !found["outsourced"]["phases"]["transport"].is_null() {
+        let parts = part("up")? + part("transport")? + part("compute")? + part("down")?;
+        ensure!(
+            (parts - median).abs() < 1e-6,
+            "{parts} is not {median}: {found:#}"
+        );
+    }
+    ensure!(found["native"]["phases"]["up"].is_null(), "{found:#}");
+    ensure!(found["sla"]["network_added"] == 20.0, "{found:#}");
     // The picture went over the network as it is.
     ensure!(
         number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0,
@@ -154,12 +168,45 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     let rows = daemon.deployer().asks(&["sla", "list", PEOPLE.name])?;
     ensure!(rows.as_array().map(Vec::len) == Some(1), "{rows:#}");
     ensure!(rows[0]["value"] == found["sla"]["desire"], "{rows:#}");
+    ensure!(
+        found["sla"]["written"] == true && found["sla"]["row"]["id"] == rows[0]["id"],
+        "{found:#}"
+    );
     let drawn = std::fs::read_to_string(plot[1])?;
     for class in ["class=\"native\"", "class=\"outsourced\""] {
         ensure!(drawn.contains(class), "{class}: {drawn}");
     }
+    large_pictures(&daemon, &recordings, plot[1])?;
     too_little_memory(&daemon, &recordings, plot[1])?;
     deployers_evaluate_what_is_theirs(&daemon, &recordings, plot[1])
+}
+
+/// Requests and answers of 1.3 MB that meet in the daemon's socket; and a second row for as many cores.
+fn large_pictures(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Verdict {
+    let bag = recordings.of("large");
+    let words = ["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"];
+    let more = ["--requests", "10", "--cpus", "1", "--robot-cpus", "0.5"];
+    let yes = ["--yes", "--plot", plot];
+    let outcome = daemon
+        .deployer()
+        .types(&[&words[..], &more, &yes].concat())?
+        .succeeded()?;
+    for words in ["10 of 10", "request: ", " 1.3M, answer: /", "HELD UP MS"] {
+        ensure!(
+            outcome.stdout.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    if outcome.stdout.contains("worth it: outsourced") {
+        let words = "has had rows for as many cores before (";
+        ensure!(
+            outcome.stdout.contains(words),
+            "{words}: {}",
+            outcome.said()
+        );
+    }
+    none_is_left(daemon, PEOPLE.name)
 }
 
 /// That is an answer, and robots are given servants as before.
@@ -197,7 +244,7 @@ fn too_little_memory(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Ve
         .succeeded()?;
     for words in [
         "out of memory",
-        "as pushed",
+        "answer: /",
         "local = \"none\"",
         "nothing was written; --yes",
     ] {
@@ -224,7 +271,7 @@ fn deployers_evaluate_what_is_theirs(
     for words in [
         "10 of 10",
         "/chatter of the recording went to /teller/say",
-        "in stub.toml (desire is what 95 % of 10 outsourced requests took",
+        "without a codec",
     ] {
         ensure!(
             outcome.stdout.contains(words),
@@ -232,6 +279,14 @@ fn deployers_evaluate_what_is_theirs(
             outcome.said()
         );
     }
+    // It may be faster without a network, and then nothing is suggested.
+    let suggested = "in stub.toml (desire is what 95 % of 10 outsourced requests took";
+    let is_suggested = outcome.stdout.contains(suggested);
+    ensure!(
+        is_suggested != outcome.stdout.contains("it is faster on the robot"),
+        "{}",
+        outcome.said()
+    );
     none_is_left(daemon, TELLER.name)
 }
 
@@ -270,6 +325,23 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
         &[],
         &["text.bag cannot be replayed", "no rosbag file"],
     )?;
+    let empty = place.path().join("empty.bag");
+    std::fs::write(&empty, "")?;
+    refused(TELLER.name, &empty, &[], &["the file is empty"])?;
+    let other = recordings.of("other");
+    refused(
+        TELLER.name,
+        &other,
+        &[],
+        &["/teller/say is std_msgs/Float64 there"],
+    )?;
+    let output = ["--output", "/nothing"];
+    refused(
+        TELLER.name,
+        &words,
+        &output,
+        &["has no output /nothing; its outputs are: "],
+    )?;
     let people = recordings.of("people");
     let saying = [
         "(it has /camera)",
@@ -298,10 +370,15 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
         TELLER.name,
         &words,
         &["--robot-cpus", "0"],
-        &["cpus = 0 is not between"],
+        &["--robot-cpus", "between 0.01 and 4096"],
     )?;
     refused(TELLER.name, &words, &["--robot-memory", "64T"], &["64T"])?;
-    refused(TELLER.name, &words, &["--cpus", "4000"], &["4000 cores"])?;
+    refused(
+        TELLER.name,
+        &words,
+        &["--cpus", "4000"],
+        &["--cpus 4000 cannot be measured", "4000 cores"],
+    )?;
     // Its node ends at the first request.
     let saying = [TELLER.name, "exited with status 0"];
     refused(TELLER.name, &recordings.of("end"), &[], &saying)?;

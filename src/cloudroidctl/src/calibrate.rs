@@ -206,7 +206,7 @@ fn pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-fn in_a_line(point: &Point) -> String {
+pub(crate) fn in_a_line(point: &Point) -> String {
     match point.compute {
         Some(compute) => format!(
             "{} of {} answered: {:.1} ms (median), {:.1} ms (95 %)",
@@ -273,15 +273,18 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     rows(&calibration.rows)
 }
 
-/// Writes rows into the dictionary of a service.
-pub(crate) async fn write(client: &Client, service: &str, rows: Vec<Row>) -> anyhow::Result<()> {
+/// Writes rows into the dictionary of a service; all rows that it has then.
+pub(crate) async fn write(
+    client: &Client,
+    service: &str,
+    rows: Vec<Row>,
+) -> anyhow::Result<Vec<Row>> {
     let new = NewRows {
         rows,
         replace: false,
     };
     let path = format!("/api/v1/services/{}/sla", escaped(service));
-    // Whoever wants to see all rows lists them.
-    client.put::<Vec<Row>>(&path, &new).await.map(drop)
+    client.put(&path, &new).await
 }
 
 /// Refuses a place for the picture of this option that cannot be written to, before minutes of measuring.

@@ -10,18 +10,22 @@ mod side;
 mod verdict;
 
 use std::fs;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use api::calibration::{OUT_OF_MEMORY, Point};
 use api::interface::Direction;
-use api::{Calibration, CalibrationEvent, CalibrationOptions, Problem, ServiceDetail, Size};
+use api::{
+    Calibration, CalibrationEvent, CalibrationOptions, Problem, Servant, ServiceDetail, Size,
+};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
-use crate::calibrate::{agrees, check_place, write};
+use crate::calibrate::{agrees, check_place, in_a_line, write};
 use crate::client::{self, Client, escaped};
 use crate::output::{self, Format};
 use network::Network;
@@ -33,6 +37,9 @@ use verdict::Evaluation;
 /// Seconds for which the outsourced servant stays for what is asked over the network: each request may take as long as the
 /// daemon waits for one.
 const KEEP: f64 = 180.0;
+/// How often, and how often at most, it is looked whether its servant has gone.
+const LOOK: Duration = Duration::from_millis(50);
+const LOOKS: usize = 200;
 
 /// Evaluate a service on a recording: native on a robot of some size against outsourced, with phases, a verdict and an SLA.
 ///
@@ -50,20 +57,20 @@ pub struct Eval {
     #[arg(long, value_enum, default_value_t = Class::Pi)]
     robot: Class,
     /// The robot's cores, instead of those of its class.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = robot::cores, allow_hyphen_values = true)]
     robot_cpus: Option<f64>,
     /// The robot's memory, instead of that of its class.
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", value_parser = robot::memory)]
     robot_memory: Option<Size>,
     /// Cores of the outsourced servant; by default those that it was pushed with, else one core, which the row promises then.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = robot::cores, allow_hyphen_values = true)]
     cpus: Option<f64>,
     /// What a network adds to what is measured, where this is typed at the server itself: lan (1 ms each way, 100 Mbit/s), wan (30 ms,
     /// 20 Mbit/s), or milliseconds for each request.
     #[arg(long, value_name = "lan|wan|MS")]
     network: Option<Network>,
     /// Requests on each side, at most; 40 by default.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = robot::requests)]
     requests: Option<usize>,
     /// Each request follows the last answer at once, instead of the recording's pace.
     #[arg(long)]
@@ -71,6 +78,9 @@ pub struct Eval {
     /// The input whose messages are the requests; by default the recording's first topic that is an input.
     #[arg(long, value_name = "TOPIC")]
     input: Option<String>,
+    /// The output whose messages are the answers over the network; by default that whose message comes first.
+    #[arg(long, value_name = "TOPIC")]
+    output: Option<String>,
     /// Where to draw the distribution of response times; SERVICE-evaluation.svg by default.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
@@ -87,20 +97,27 @@ impl Eval {
         let file = Bytes::from(file);
         // What cannot be replayed is told before anything is sent or started.
         let recorded = ros::bag::read(&file, probe::RECORDED)
-            .with_context(|| format!("{} cannot be replayed", self.bag.display()))?;
+            .map_err(|why| unusable(format!("{} cannot be replayed: {why}", self.bag.display())))?;
         let service = self.check(client).await?;
+        self.check_room(client).await?;
         let plot = self
             .plot
             .clone()
             .unwrap_or_else(|| PathBuf::from(format!("{}-evaluation.svg", self.service)));
         check_place(&plot, "plot")?;
-        let measured = tokio::select! {
+        let mut measured = tokio::select! {
             measured = self.measure(client, format, file, &recorded, &service) => measured?,
             _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
         };
         // What was measured is shown all the same.
         let drawn = fs::write(&plot, plot::draw(&measured))
             .with_context(|| format!("cannot write the plot {}", plot.display()));
+        // In JSON all is one value.
+        let is_written = self.yes && matches!(format, Format::Json);
+        let written = match is_written {
+            true => self.write(client, &mut measured).await.map(drop),
+            false => Ok(()),
+        };
         match format {
             Format::Json => output::json(&measured)?,
             Format::Table => shown::print(&measured, &plot)?,
@@ -108,7 +125,25 @@ impl Eval {
         if let Err(error) = drawn {
             output::complain(&format!("warning: {error:#}"));
         }
-        self.propose(client, format, measured).await
+        if let Some(why) = &measured.outsourced.broken {
+            bail!(
+                "asking the servant over the network failed: {why}; what was measured before is shown"
+            );
+        }
+        written?;
+        match is_written {
+            true => Ok(()),
+            false => self.propose(client, format, measured).await,
+        }
+    }
+
+    /// Writes the row that is suggested; numbers of others that promise the same limits.
+    async fn write(&self, client: &Client, measured: &mut Evaluation) -> anyhow::Result<Vec<i64>> {
+        let Some(sla) = &mut measured.sla else {
+            return Ok(Vec::new());
+        };
+        let rows = write(client, &self.service, vec![sla.row.clone()]).await?;
+        Ok(sla.note_written(&rows))
     }
 
     /// Writes the row, where there is one and who asked says yes.
@@ -116,23 +151,62 @@ impl Eval {
         &self,
         client: &Client,
         format: Format,
-        measured: Evaluation,
+        mut measured: Evaluation,
     ) -> anyhow::Result<()> {
-        let Some(sla) = measured.sla else {
+        if measured.sla.is_none() {
             return Ok(());
-        };
+        }
         let say = |words: &str| match format {
             Format::Json => Ok(()),
             Format::Table => output::line(words),
         };
         if !self.yes && !agrees(&self.service)? {
-            return say("nothing was written; --yes writes the row without asking");
+            // Who was asked knows how to answer.
+            return say(match std::io::stdin().is_terminal() {
+                true => "nothing was written",
+                false => "nothing was written; --yes writes the row without asking",
+            });
         }
-        write(client, &self.service, vec![sla.row]).await?;
+        let name = &self.service;
+        let others = self.write(client, &mut measured).await?;
         say(&format!(
-            "1 row written; see it with: cloudroidctl sla list {}",
-            self.service
+            "1 row written; see it with: cloudroidctl sla list {name}"
+        ))?;
+        if others.is_empty() {
+            return Ok(());
+        }
+        let others: Vec<String> = others.iter().map(i64::to_string).collect();
+        let others = others.join(" ");
+        say(&format!(
+            "the dictionary has had rows for as many cores before ({others}); remove what is outdated with: cloudroidctl sla rm {name} {others}"
         ))
+    }
+
+    /// Refuses cores that no servant here can have, before minutes of measuring.
+    async fn check_room(&self, client: &Client) -> anyhow::Result<()> {
+        for (flag, cpus) in [("--robot-cpus", self.robot_cpus), ("--cpus", self.cpus)] {
+            let Some(cpus) = cpus else { continue };
+            let path = format!(
+                "/api/v1/services/{}/fit?cpus={cpus}",
+                escaped(&self.service)
+            );
+            // What robots may ask for is no matter here; what cannot be said is said when it is measured.
+            let fit = client.get::<api::Fit>(&path).await;
+            let never = fit
+                .ok()
+                .and_then(|fit| fit.never)
+                .filter(|why| is_too_big(why));
+            if let Some(why) = never {
+                return Err(Problem {
+                    status: 422,
+                    detail: format!("{flag} {cpus} cannot be measured, now and later: {why}"),
+                    next: Some(format!("name fewer with {flag}")),
+                    ..Problem::default()
+                }
+                .into());
+            }
+        }
+        Ok(())
     }
 
     /// The service, where a recording can hold its requests.
@@ -151,6 +225,17 @@ impl Eval {
         let asked = client.get(&address).await;
         let service: ServiceDetail = asked.map_err(unpublished(name, path.is_dir()))?;
         let interface = &service.interface;
+        if let Some(named) = &self.output {
+            let outputs = interface.topics.iter();
+            let outputs = outputs.filter(|topic| topic.direction == Direction::Output);
+            let outputs: Vec<&str> = outputs.map(|topic| topic.name.as_str()).collect();
+            if !outputs.contains(&named.as_str()) {
+                return Err(unusable(format!(
+                    "{name} has no output {named}; its outputs are: {}",
+                    outputs.join(", ")
+                )));
+            }
+        }
         let is_fed = |topic: &api::interface::Topic| topic.direction == Direction::Input;
         if !interface.topics.iter().any(is_fed) {
             let calls: Vec<&str> = interface
@@ -192,7 +277,7 @@ impl Eval {
         };
         let native = match self.ask(client, options, file.clone(), &tell).await {
             Ok(measured) => Side::native(&measured.calibration, measured.times, &robot),
-            Err(error) => Side::starved(&robot, out_of_memory(error)?),
+            Err(error) => Side::starved(&robot, out_of_memory(for_robot(error))?),
         };
         tell("== outsourced")?;
         let options = CalibrationOptions {
@@ -203,6 +288,9 @@ impl Eval {
         };
         // Its servant lives for as long as this does.
         let measured = self.ask(client, options, file, &tell).await?;
+        let servant = measured.servant.as_deref();
+        let place = servant.map(|servant| format!("/api/v1/servants/{}", escaped(servant)));
+        let limits = limits(client, place.as_deref()).await;
         let asked = match &measured.servant {
             Some(servant) if answers(&measured.calibration) => {
                 tell("   the same over the network, from here")?;
@@ -211,17 +299,44 @@ impl Eval {
                     calibration: &measured.calibration,
                     recorded,
                     input: self.input.as_deref(),
+                    output: self.output.as_deref(),
                     fast: self.fast,
                     requests: self.requests.unwrap_or(probe::REQUESTS),
                 };
-                probe.ask(client, servant).await?
+                match probe.ask(client, servant).await {
+                    Ok(asked) => asked,
+                    Err(error) => Asked::broken(format!("{error:#}")),
+                }
             }
             // Nor would it answer from here.
             _ => Asked::unanswered(point(&measured.calibration).requests),
         };
-        let outsourced = Side::outsourced(&measured.calibration, &asked, self.network);
+        let now = self::limits(client, place.as_deref()).await;
+        if now.is_some() && now != limits {
+            bail!(
+                "somebody has changed the limits of the servant while it was measured; evaluate again"
+            );
+        }
+        let mut outsourced = Side::outsourced(&measured.calibration, &asked, self.network);
+        outsourced.memory_limit = limits.and_then(|limits| limits.memory);
+        if let Some(rrt) = outsourced.rrt {
+            tell(&format!(
+                "   {} of {} answered: {:.1} ms (median), {:.1} ms (95 %)",
+                outsourced.answered, outsourced.requests, rrt.p50, rrt.p95
+            ))?;
+        }
+        // Whoever evaluates next finds the room that this had.
+        let Measured {
+            calibration,
+            events,
+            ..
+        } = measured;
+        drop(events);
+        if let Some(place) = &place {
+            gone(client, place).await;
+        }
         Ok(Evaluation::new(
-            &measured.calibration,
+            &calibration,
             self.bag.display().to_string(),
             robot,
             (native, outsourced),
@@ -270,7 +385,8 @@ impl Eval {
                     tell(&format!("   {title}"))?;
                     continue;
                 }
-                CalibrationEvent::Measured { times, .. } => {
+                CalibrationEvent::Measured { times, point } => {
+                    tell(&format!("   {}", in_a_line(&point)))?;
                     measured = times;
                     continue;
                 }
@@ -279,7 +395,7 @@ impl Eval {
                 calibration: *calibration,
                 times: measured,
                 servant,
-                _events: events,
+                events,
             });
         }
         bail!("the daemon broke off the measurement; nothing was written")
@@ -293,7 +409,52 @@ struct Measured {
     times: Vec<f64>,
     /// It stays for as long as the events are there.
     servant: Option<String>,
-    _events: std::pin::Pin<Box<dyn futures_util::Stream<Item = anyhow::Result<CalibrationEvent>>>>,
+    events: std::pin::Pin<Box<dyn futures_util::Stream<Item = anyhow::Result<CalibrationEvent>>>>,
+}
+
+/// What a servant is limited to, where it is there.
+async fn limits(client: &Client, place: Option<&str>) -> Option<api::Limits> {
+    let servant = client.get::<Servant>(place?).await;
+    servant.ok().map(|servant| servant.limits)
+}
+
+/// Comes back when the servant has gone, or is not told to go.
+async fn gone(client: &Client, place: &str) {
+    for _ in 0..LOOKS {
+        if client.get::<Servant>(place).await.is_err() {
+            return;
+        }
+        tokio::time::sleep(LOOK).await;
+    }
+}
+
+/// What cannot be used as it is given.
+fn unusable(detail: String) -> anyhow::Error {
+    Problem {
+        status: 400,
+        detail,
+        ..Problem::default()
+    }
+    .into()
+}
+
+/// Whether it is the machine that is too small, of all reasons why a servant is never admitted.
+fn is_too_big(why: &str) -> bool {
+    why.contains("does not fit on this machine")
+}
+
+/// A problem of the side that stands for the robot names the option that is its.
+fn for_robot(error: anyhow::Error) -> anyhow::Error {
+    let named = |words: String| words.replace(" --cpus", " --robot-cpus");
+    match error.downcast::<Problem>() {
+        Ok(problem) => Problem {
+            detail: named(problem.detail),
+            next: problem.next.map(named),
+            ..problem
+        }
+        .into(),
+        Err(error) => error,
+    }
 }
 
 /// At the only limit.
@@ -349,6 +510,45 @@ mod tests {
         assert_eq!(told.expect("an answer"), "needs more than 1G");
         out_of_memory(problem("urn:cloudroid:full").into()).expect_err("no answer");
         out_of_memory(anyhow::anyhow!("broken")).expect_err("no answer");
+    }
+
+    #[test]
+    fn what_the_robot_cannot_have_is_named_by_its_own_option() {
+        let problem = Problem {
+            detail: "there is no room; name smaller limits with --cpus".into(),
+            next: Some("push it with smaller --cpus".into()),
+            ..Problem::default()
+        };
+        let told = for_robot(problem.into());
+        let told = told.downcast::<Problem>().expect("a problem");
+        assert!(told.detail.ends_with("with --robot-cpus"), "{told}");
+        assert_eq!(
+            told.next.as_deref(),
+            Some("push it with smaller --robot-cpus")
+        );
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_measured_are_usage_errors_that_name_the_option() {
+        use clap::Parser;
+        #[derive(Debug, Parser)]
+        struct Line {
+            #[command(flatten)]
+            eval: Eval,
+        }
+        for (option, value, range) in [
+            ("--robot-memory", "1", "16M or more"),
+            ("--robot-cpus", "nan", "between 0.01 and 4096"),
+            ("--robot-cpus", "-1", "between 0.01 and 4096"),
+            ("--cpus", "0", "between 0.01 and 4096"),
+            ("--requests", "0", "between 10 and 10000"),
+        ] {
+            let line = ["eval", "people", "--bag", "x.bag", option, value];
+            let refused = Line::try_parse_from(line).expect_err(option);
+            let told = refused.to_string();
+            assert_eq!(refused.exit_code(), 2);
+            assert!(told.contains(option) && told.contains(range), "{told}");
+        }
     }
 
     #[test]

@@ -59,6 +59,25 @@ impl Axis {
     }
 }
 
+impl Axis {
+    /// Its ticks; where these are fewer than four, multiples of a round step.
+    pub(crate) fn fine_ticks(&self) -> Vec<f64> {
+        let ticks = self.ticks();
+        let span = self.to - self.from;
+        if ticks.len() >= 4 || span <= 0.0 {
+            return ticks;
+        }
+        let power = 10f64.powf((span / 4.0).log10().floor());
+        let steps = [5.0, 2.0, 1.0].map(|digit| digit * power);
+        let step = steps.into_iter().find(|step| span / step >= 4.0);
+        let step = step.unwrap_or(power);
+        let (first, last) = ((self.from / step).ceil(), (self.to / step).floor());
+        (first as i64..=last as i64)
+            .map(|number| number as f64 * step)
+            .collect()
+    }
+}
+
 /// The whole picture.
 pub fn draw(calibration: &Calibration) -> String {
     let measured: Vec<(&Point, TimeSpread)> = calibration

@@ -16,6 +16,11 @@ pub struct Network {
 }
 
 impl Network {
+    /// Whether it adds anything.
+    pub fn adds(&self) -> bool {
+        self.each_way > 0.0 || self.mbits.is_some()
+    }
+
     /// For a message of so many bytes one way, in milliseconds: the delay, and the time that its bits take.
     pub fn one_way(&self, bytes: usize) -> f64 {
         let bits = bytes as f64 * 8.0;
@@ -74,6 +79,7 @@ mod tests {
         let given = read("25").expect("a number");
         assert_eq!(given.one_way(1 << 30) * 2.0, 25.0);
         assert_eq!(given.to_string(), "25 ms for each request");
+        assert!(given.adds() && lan.adds() && !read("0").expect("a number").adds());
         for wrong in ["wifi", "-1", "nan", ""] {
             read(wrong).expect_err(wrong);
         }

@@ -1,13 +1,17 @@
 //! The distribution of response times, native against outsourced, as SVG: the share of requests that were answered within a time, which
 //! is logarithmic.
 
-use crate::calibrate::curve::{
-    Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, number, put, text,
-};
+use std::path::Path;
+
+use crate::calibrate::curve::{Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, WIDTH, number, put, text};
 use crate::eval::side::Side;
 use crate::eval::verdict::Evaluation;
 
 const ORANGE: &str = "#d95f02";
+/// Above the panel: two lines of a title, and one for each side.
+const TOP: f64 = 95.0;
+/// Longer words of a title are cut.
+const LONGEST: usize = 60;
 
 /// The whole picture.
 pub fn draw(of: &Evaluation) -> String {
@@ -27,23 +31,43 @@ pub fn draw(of: &Evaluation) -> String {
         of.service, of.revision
     );
     text(&mut out, (LEFT, 20.0), "start", &title);
+    text(&mut out, (LEFT, 38.0), "start", &conditions(of));
     grid(&mut out, &x);
     for (side, colour, class, legend) in [
-        (&of.native, ORANGE, "native", LEFT),
-        (&of.outsourced, BLUE, "outsourced", LEFT + WIDTH / 2.0),
+        (&of.native, ORANGE, "native", 60.0),
+        (&of.outsourced, BLUE, "outsourced", 78.0),
     ] {
         distribution(&mut out, &x, side, colour, class);
         put(
             &mut out,
             format_args!(
-                "<rect x=\"{legend:.1}\" y=\"29\" width=\"10\" height=\"10\" fill=\"{colour}\"/>"
+                "<rect x=\"{LEFT:.1}\" y=\"{:.1}\" width=\"10\" height=\"10\" fill=\"{colour}\"/>",
+                legend - 9.0
             ),
         );
-        text(&mut out, (legend + 15.0, 38.0), "start", &told(class, side));
+        text(&mut out, (LEFT + 15.0, legend), "start", &told(class, side));
     }
     let (middle, below) = (LEFT + WIDTH / 2.0, height - 12.0);
     text(&mut out, (middle, below), "middle", "response time, ms");
     out + "</svg>\n"
+}
+
+/// What was measured with what.
+fn conditions(of: &Evaluation) -> String {
+    let bag = Path::new(&of.bag).file_name();
+    let bag: String = bag.map_or(String::new(), |name| {
+        name.to_string_lossy().chars().take(LONGEST).collect()
+    });
+    let robot = of
+        .robot
+        .map(|robot| format!("{robot}; "))
+        .unwrap_or_default();
+    let network = match of.network.filter(|network| network.adds()) {
+        Some(network) => format!("added network: {network}"),
+        None => "no network added".to_owned(),
+    };
+    let requests = of.native.requests.max(of.outsourced.requests);
+    format!("{robot}{bag}, {requests} requests; {network}")
 }
 
 fn told(name: &str, side: &Side) -> String {
@@ -72,13 +96,13 @@ fn grid(out: &mut String, x: &Axis) {
         );
     };
     let shares = [0.0, 0.25, 0.5, 0.75, 0.95, 1.0];
-    for tick in x.ticks() {
+    for tick in x.fine_ticks() {
         line(x.at(tick), TOP, x.at(tick), TOP + HEIGHT);
     }
     for share in shares {
         line(LEFT, height(share), LEFT + WIDTH, height(share));
     }
-    for tick in x.ticks() {
+    for tick in x.fine_ticks() {
         let at = (x.at(tick), TOP + HEIGHT + 16.0);
         text(out, at, "middle", &number(tick));
     }
@@ -168,6 +192,52 @@ mod tests {
             svg.contains("native, 0.25 cores: 500.0 ms (median)"),
             "{svg}"
         );
+    }
+
+    /// Places of words, by what they contain.
+    fn place(svg: &str, words: &str) -> (f64, f64) {
+        let line = svg.lines().find(|line| line.contains(words));
+        let line = line.unwrap_or_else(|| panic!("{words}: {svg}"));
+        let part = |name: &str| {
+            let value = line
+                .split(name)
+                .nth(1)
+                .and_then(|rest| rest.split('"').next());
+            value
+                .and_then(|value| value.parse().ok())
+                .expect("a number")
+        };
+        (part(" x=\""), part(" y=\""))
+    }
+
+    #[test]
+    fn each_side_has_a_line_of_its_own_and_the_title_says_what_was_measured() {
+        let svg = draw(&Evaluation {
+            service: "people".into(),
+            bag: "/somewhere/corridor.bag".into(),
+            robot: Some(crate::eval::side::tests::robot()),
+            network: "lan".parse().ok(),
+            native: side(&[193.6, 204.1], 2),
+            outsourced: side(&[193.0, 201.0], 2),
+            ..Evaluation::default()
+        });
+        let (native, outsourced) = (place(&svg, ">native, "), place(&svg, ">outsourced, "));
+        assert!(
+            native.0 == outsourced.0 && native.1 + 12.0 <= outsourced.1,
+            "{svg}"
+        );
+        assert!(outsourced.1 < TOP, "above the panel: {svg}");
+        for words in [
+            "a robot with 0.25 cores and 1G",
+            "corridor.bag, 2 requests",
+            "1 ms each way",
+        ] {
+            assert!(svg.contains(words), "{words}: {svg}");
+        }
+        let ticks = svg.lines().filter(|line| {
+            line.contains("text-anchor=\"middle\"") && !line.contains("response time")
+        });
+        assert!(ticks.count() >= 4, "{svg}");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use api::interface::Direction;
-use api::{Calibration, ServiceDetail};
+use api::{Calibration, ServiceDetail, Size};
 use bytes::Bytes;
 use foxglove::ws_protocol::client::advertise::Channel;
 use foxglove::ws_protocol::client::{Advertise, MessageData, Subscribe, Subscription};
@@ -30,6 +30,9 @@ const ANSWER: Duration = Duration::from_secs(10);
 const WHOLE: Duration = Duration::from_secs(60);
 /// So many requests in vain, one after the other, are enough.
 const IN_VAIN: usize = 3;
+/// Until one was answered, a request is made again after this and twice the longest time at the node: a node may begin to listen only when
+/// it is listened to, and the first messages are lost.
+const AGAIN: Duration = Duration::from_millis(500);
 /// Longer pauses of a recording are cut to this.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Messages of a topic that wait in the daemon.
@@ -45,6 +48,12 @@ pub struct Asked {
     pub request: usize,
     /// Bytes of the largest answer.
     pub answer: usize,
+    /// The input that was asked.
+    pub asked: Option<String>,
+    /// The output that answered.
+    pub answered_by: Option<String>,
+    /// Why they ended before all were made.
+    pub broken: Option<String>,
 }
 
 impl Asked {
@@ -52,6 +61,14 @@ impl Asked {
     pub fn unanswered(requests: usize) -> Asked {
         Asked {
             times: vec![None; requests],
+            ..Asked::default()
+        }
+    }
+
+    /// It came to nothing.
+    pub fn broken(why: String) -> Asked {
+        Asked {
+            broken: Some(why),
             ..Asked::default()
         }
     }
@@ -76,6 +93,8 @@ pub struct Probe<'a> {
     pub recorded: &'a [Recorded],
     /// The input whose messages are the requests; none: the first that the recording feeds.
     pub input: Option<&'a str>,
+    /// The output whose messages are the answers; none: that whose message comes first.
+    pub output: Option<&'a str>,
     /// Each request follows the answer before it.
     pub fast: bool,
     /// Requests whose times are wanted.
@@ -106,16 +125,30 @@ impl Probe<'_> {
         let mut line = Line {
             inside: Inside::attach(client, servant, DEPTH).await?,
             service: self.service,
+            output: self.output,
             registry,
             outputs: HashMap::new(),
             answering: None,
         };
         line.open(self.calibration).await?;
-        self.asks(&mut line, &round).await
+        let input = self.calibration.inputs.get(round.request);
+        let mut asked = Asked {
+            asked: input.map(|input| input.topic.clone()),
+            ..Asked::default()
+        };
+        // What was answered before stays measured.
+        if let Err(error) = self.asks(&mut line, &round, &mut asked).await {
+            asked.broken = Some(format!("{error:#}"));
+        }
+        Ok(asked)
     }
 
-    async fn asks(&self, line: &mut Line<'_>, round: &Round) -> anyhow::Result<Asked> {
-        let mut asked = Asked::default();
+    async fn asks(
+        &self,
+        line: &mut Line<'_>,
+        round: &Round,
+        asked: &mut Asked,
+    ) -> anyhow::Result<()> {
         let ends = Instant::now() + WHOLE;
         let mut began = Instant::now();
         let (mut warm, mut in_vain) = (false, 0);
@@ -132,23 +165,53 @@ impl Probe<'_> {
                 .saturating_duration_since(due)
                 .saturating_sub(round.gap());
             line.wait(due).await?;
-            let since = Instant::now();
-            line.publish(item).await?;
+            let mut since = Instant::now();
+            let given_up = since + ANSWER;
+            line.publish(item, given_up).await?;
             if item.input != round.request {
                 continue;
             }
             asked.request = asked.request.max(item.bytes.len());
             let stamp = line.stamp(&self.calibration.inputs[item.input].type_name, &item.bytes);
-            let answer = line.answer(stamp, since + ANSWER).await?;
+            let answer = loop {
+                let patience = if warm {
+                    ANSWER
+                } else {
+                    again(self.calibration)
+                };
+                let until = given_up.min(since + patience);
+                let answer = line.answer(stamp, until).await?;
+                if answer.is_some() || until >= given_up {
+                    break answer;
+                }
+                since = Instant::now();
+                line.publish(item, given_up).await?;
+            };
             in_vain = if answer.is_some() { 0 } else { in_vain + 1 };
-            if let Some((_, bytes)) = answer {
-                asked.answer = asked.answer.max(bytes);
+            if let Some(answer) = &answer {
+                asked.answer = asked.answer.max(answer.bytes);
+                asked.answered_by = line.named(answer.output);
             }
-            let took = answer.map(|(at, _)| (at - since).as_secs_f64() * 1000.0);
+            let took = answer.map(|answer| (answer.at - since).as_secs_f64() * 1000.0);
             asked.note(took, &mut warm);
         }
-        Ok(asked)
+        Ok(())
     }
+}
+
+/// After which a request is made again that nobody may have heard.
+fn again(calibration: &Calibration) -> Duration {
+    let longest = super::point(calibration).compute;
+    let longest = longest.map_or(0.0, |compute| compute.max);
+    AGAIN + Duration::from_secs_f64(longest * 2.0 / 1000.0).min(ANSWER)
+}
+
+/// An answer.
+struct Answer {
+    at: Instant,
+    /// Number of the subscription.
+    output: u32,
+    bytes: usize,
 }
 
 /// The recording's messages that go to an input, once.
@@ -218,9 +281,11 @@ impl Round {
 struct Line<'a> {
     inside: Inside,
     service: &'a ServiceDetail,
+    /// The only output that is listened to.
+    output: Option<&'a str>,
     registry: Registry,
-    /// Types of outputs that are listened to, by subscription.
-    outputs: HashMap<u32, String>,
+    /// Names and types of outputs that are listened to, by subscription.
+    outputs: HashMap<u32, (String, String)>,
     /// The output whose messages answer requests that have no stamp.
     answering: Option<u32>,
 }
@@ -233,7 +298,8 @@ impl Line<'_> {
         while self.outputs.is_empty() {
             if Instant::now() >= deadline {
                 bail!(
-                    "nothing of {} is published where it could be heard from here",
+                    "{} of {} is not published where it could be heard from here",
+                    self.output.unwrap_or("any output"),
                     calibration.service
                 );
             }
@@ -247,9 +313,21 @@ impl Line<'_> {
         Ok(())
     }
 
-    async fn publish(&mut self, item: &Item) -> anyhow::Result<()> {
+    async fn publish(&mut self, item: &Item, deadline: Instant) -> anyhow::Result<()> {
         let message = MessageData::new(u32::try_from(item.input)?, &item.bytes[..]);
-        self.inside.send(&message).await
+        match timeout_at(deadline, self.inside.send(&message)).await {
+            Ok(sent) => sent,
+            // Half of a message may be on its way.
+            Err(_) => bail!(
+                "a request of {} was not taken within {} s",
+                Size(item.bytes.len() as u64),
+                ANSWER.as_secs()
+            ),
+        }
+    }
+
+    fn named(&self, output: u32) -> Option<String> {
+        self.outputs.get(&output).map(|(name, _)| name.clone())
     }
 
     fn stamp(&self, type_name: &str, bytes: &[u8]) -> Option<Time> {
@@ -268,7 +346,7 @@ impl Line<'_> {
         &mut self,
         asked: Option<Time>,
         deadline: Instant,
-    ) -> anyhow::Result<Option<(Instant, usize)>> {
+    ) -> anyhow::Result<Option<Answer>> {
         loop {
             let Some(heard) = self.next(deadline).await? else {
                 return Ok(None);
@@ -277,13 +355,17 @@ impl Line<'_> {
                 continue;
             };
             let stamp = self.outputs.get(&number);
-            let stamp = stamp.and_then(|type_name| self.stamp(type_name, &bytes));
+            let stamp = stamp.and_then(|(_, type_name)| self.stamp(type_name, &bytes));
             let answers = match (asked, stamp) {
                 (Some(asked), Some(stamp)) => asked == stamp,
                 _ => *self.answering.get_or_insert(number) == number,
             };
             if answers {
-                return Ok(Some((at, bytes.len())));
+                return Ok(Some(Answer {
+                    at,
+                    output: number,
+                    bytes: bytes.len(),
+                }));
             }
         }
     }
@@ -297,11 +379,10 @@ impl Line<'_> {
         &mut self,
         deadline: Instant,
     ) -> anyhow::Result<Option<Option<(u32, Instant, Vec<u8>)>>> {
-        let Ok(message) = timeout_at(deadline, self.inside.next()).await else {
+        let Ok(message) = timeout_at(deadline, self.inside.next_at()).await else {
             return Ok(None);
         };
-        let at = Instant::now();
-        let Some(message) = message? else {
+        let Some((at, message)) = message? else {
             bail!("the measured servant has ended while it was asked over the network")
         };
         match inside::read(&message) {
@@ -322,11 +403,14 @@ impl Line<'_> {
     async fn listen(&mut self, channel: u64, topic: &str) -> anyhow::Result<()> {
         // Latched outputs tell a state; they answer nothing.
         let output = self.service.interface.topics.iter().find(|known| {
-            known.direction == Direction::Output && !known.latched && known.name == *topic
+            known.direction == Direction::Output
+                && known.name == *topic
+                && self.output.map_or(!known.latched, |only| only == topic)
         });
         let Some(output) = output else { return Ok(()) };
         let number = u32::try_from(self.outputs.len())? + 1;
-        self.outputs.insert(number, output.type_name.clone());
+        self.outputs
+            .insert(number, (output.name.clone(), output.type_name.clone()));
         let wanted = Subscribe::new([Subscription::new(number, channel)]);
         self.inside.send(&wanted).await
     }
@@ -372,6 +456,13 @@ mod tests {
             [Some(2.0), None]
         );
         assert_eq!(noted(&[Some(9.0), None]), [None]);
+    }
+
+    #[test]
+    fn the_first_request_is_made_again_soon_but_not_before_a_slow_node_can_answer() {
+        let again = |compute: f64| again(&crate::eval::side::tests::calibration(1.0, compute, 20));
+        assert_eq!(again(24.0), AGAIN + Duration::from_millis(48));
+        assert!(again(4000.0) > Duration::from_secs(8));
     }
 
     #[test]

@@ -15,6 +15,34 @@ pub enum Class {
     Ultrabook,
 }
 
+/// Reads cores, as the daemon measures with them.
+pub fn cores(text: &str) -> Result<f64, String> {
+    let cores: f64 = text
+        .parse()
+        .map_err(|_| "it is no number of cores".to_owned())?;
+    match (0.01..=4096.0).contains(&cores) {
+        true => Ok(cores),
+        false => Err("cores are between 0.01 and 4096".to_owned()),
+    }
+}
+
+/// Reads memory that something can be measured with.
+pub fn memory(text: &str) -> Result<Size, String> {
+    let memory: Size = text.parse().map_err(|wrong| format!("{wrong}"))?;
+    match memory >= Size(16 << 20) {
+        true => Ok(memory),
+        false => Err("it is 16M or more, such as 512M".to_owned()),
+    }
+}
+
+/// Reads a number of requests that says something.
+pub fn requests(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(requests @ 10..=10_000) => Ok(requests),
+        _ => Err("requests are between 10 and 10000".to_owned()),
+    }
+}
+
 /// What one has.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Robot {
@@ -55,6 +83,24 @@ impl fmt::Display for Robot {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_cannot_be_measured_is_refused_with_its_range() {
+        for wrong in ["0", "nan", "-1", "inf", "many", ""] {
+            cores(wrong).expect_err(wrong);
+            requests(wrong).expect_err(wrong);
+        }
+        assert_eq!(cores("0.25"), Ok(0.25));
+        assert!(memory("1").expect_err("too little").contains("16M"));
+        memory("much").expect_err("no size");
+        assert_eq!(memory("512M"), Ok(Size(512 << 20)));
+        assert!(
+            requests("9")
+                .expect_err("too few")
+                .contains("between 10 and")
+        );
+        assert_eq!(requests("10"), Ok(10));
+    }
 
     #[test]
     fn numbers_that_are_given_take_the_place_of_the_classs() {

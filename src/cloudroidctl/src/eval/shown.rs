@@ -17,7 +17,10 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
     response_times(of)?;
     output::line("")?;
     phases(of)?;
-    if let Some(network) = of.network {
+    if let Some(words) = messages(&of.outsourced) {
+        output::line(&words)?;
+    }
+    if let Some(network) = of.network.filter(|network| network.adds()) {
         output::line(&format!(
             "UP and DOWN are a network of {network}, which was not there: it is added"
         ))?;
@@ -34,9 +37,8 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
     ))?;
     output::line(&of.verdict)?;
     let Some(sla) = &of.sla else {
-        return output::line(
-            "no SLA is suggested: outsourced, too few requests were answered, or not at the recording's pace",
-        );
+        let why = of.unsuggested.as_deref().unwrap_or_default();
+        return output::line(&format!("no SLA is suggested: {why}"));
     };
     output::line(&format!("\nin stub.toml ({}):", sla.reason))?;
     for line in sla.stub_toml() {
@@ -44,6 +46,19 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
     }
     output::line("")?;
     rows(std::slice::from_ref(&sla.row))
+}
+
+/// What went over the network: the largest of both.
+fn messages(outsourced: &Side) -> Option<String> {
+    let answered_by = outsourced.answered_by.as_deref()?;
+    let (request, answer) = outsourced.bytes;
+    let size = |bytes: usize| Size(bytes as u64);
+    Some(format!(
+        "request: {} {}, answer: {answered_by} {}",
+        outsourced.asked.as_deref().unwrap_or("-"),
+        size(request),
+        size(answer)
+    ))
 }
 
 fn sides(of: &Evaluation) -> [(&'static str, &Side); 2] {
@@ -61,13 +76,14 @@ fn response_times(of: &Evaluation) -> anyhow::Result<()> {
         };
         let answered = match side.out_of_memory {
             Some(_) => "out of memory".to_owned(),
+            None if side.broken.is_some() => "broken off".to_owned(),
             None => format!("{} of {}", side.answered, side.requests),
         };
         let limit = side.memory_limit.map(|limit| limit.to_string());
         table.row([
             name.to_owned(),
             side.cpus.to_string(),
-            limit.unwrap_or_else(|| "as pushed".to_owned()),
+            limit.unwrap_or_else(|| "no limit".to_owned()),
             match side.memory {
                 Size(0) => "-".to_owned(),
                 used => used.to_string(),
@@ -84,12 +100,12 @@ fn response_times(of: &Evaluation) -> anyhow::Result<()> {
 fn phases(of: &Evaluation) -> anyhow::Result<()> {
     let mut table = Table::new(&[
         "",
-        "UP",
-        "TRANSPORT",
-        "DOWN",
-        "COMPUTE",
-        "RUNNING",
-        "HELD UP",
+        "UP MS",
+        "TRANSPORT MS",
+        "DOWN MS",
+        "COMPUTE MS",
+        "RUNNING MS",
+        "HELD UP MS",
     ]);
     for (name, side) in sides(of) {
         let cells = side.phases.map(|phases| {
@@ -97,11 +113,11 @@ fn phases(of: &Evaluation) -> anyhow::Result<()> {
                 phases.up,
                 phases.transport,
                 phases.down,
-                phases.compute,
-                phases.running,
-                phases.held_up,
+                Some(phases.compute),
+                Some(phases.running),
+                Some(phases.held_up),
             ]
-            .map(|time| format!("{time:.1}"))
+            .map(|time| time.map_or("-".to_owned(), |time| format!("{time:.1}")))
         });
         let cells = cells.unwrap_or_else(|| std::array::from_fn(|_| "-".to_owned()));
         table.row(std::iter::once(name.to_owned()).chain(cells));

@@ -25,6 +25,9 @@ pub struct Side {
     /// Why the kernel has ended it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub out_of_memory: Option<String>,
+    /// Why it was not measured over the network.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub broken: Option<String>,
     /// Requests.
     pub requests: usize,
     /// Of them were answered.
@@ -42,6 +45,12 @@ pub struct Side {
     pub memory: Size,
     /// Size of the largest request, and of the largest answer where it was heard from here.
     pub bytes: (usize, usize),
+    /// The input that was asked from here.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub asked: Option<String>,
+    /// The output that answered, where it was heard from here.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub answered_by: Option<String>,
     /// Of each answered request.
     pub times: Vec<f64>,
 }
@@ -49,12 +58,13 @@ pub struct Side {
 /// Parts of a request's time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Phases {
-    /// Up by the added network.
-    pub up: f64,
-    /// Between here and the servant's node, both ways: what is over of the median when that of the node is taken away.
-    pub transport: f64,
+    /// Up by the added network; none where requests cross none.
+    pub up: Option<f64>,
+    /// Between here and the servant's node, both ways: what is over of the median when that of the node is taken away. None where
+    /// nothing is over: the medians are of two runs.
+    pub transport: Option<f64>,
     /// Down by the added network.
-    pub down: f64,
+    pub down: Option<f64>,
     /// From the request's arrival at the node to its answer (median).
     pub compute: f64,
     /// Of it processor time, on average, summed over cores.
@@ -70,7 +80,6 @@ impl Side {
         Side {
             cpus: point.cpus,
             memory_limit: Some(robot.memory),
-            out_of_memory: None,
             requests: point.requests,
             answered: point.answered,
             rrt: point.compute,
@@ -84,6 +93,7 @@ impl Side {
             memory: point.memory,
             bytes: (calibration.largest.0 as usize, 0),
             times,
+            ..Side::default()
         }
     }
 
@@ -109,19 +119,19 @@ impl Side {
         let heard: Vec<f64> = asked.times.iter().flatten().copied().collect();
         let seen = TimeSpread::of(heard.clone());
         let times: Vec<f64> = heard.iter().map(|time| time + up + down).collect();
-        let phases = seen.zip(point.compute).map(|(seen, compute)| Phases {
-            up,
-            // Two runs: their medians may differ by chance.
-            transport: (seen.p50 - compute.p50).max(0.0),
-            down,
-            compute: compute.p50.min(seen.p50),
+        let phases = point.compute.map(|compute| Phases {
+            up: seen.and(Some(up)),
+            transport: seen
+                .map(|seen| seen.p50 - compute.p50)
+                .filter(|over| *over > 0.0),
+            down: seen.and(Some(down)),
+            compute: compute.p50,
             running: point.running,
             held_up: point.throttled,
         });
         Side {
             cpus: point.cpus,
-            memory_limit: None,
-            out_of_memory: None,
+            broken: asked.broken.clone(),
             requests: asked.times.len(),
             answered: times.len(),
             rrt: TimeSpread::of(times.clone()),
@@ -129,7 +139,10 @@ impl Side {
             rate: Some(point.rate),
             memory: point.memory,
             bytes: (asked.request, asked.answer),
+            asked: asked.asked.clone(),
+            answered_by: asked.answered_by.clone(),
             times,
+            ..Side::default()
         }
     }
 
@@ -202,7 +215,7 @@ pub(super) mod tests {
         Asked {
             times: vec![Some(time); 20],
             request: 125_000,
-            answer: 0,
+            ..Asked::default()
         }
     }
 
@@ -215,13 +228,38 @@ pub(super) mod tests {
         );
         // 1 ms up and 10 ms for a megabit; 1 ms down.
         let phases = side.phases.expect("phases");
-        assert!((phases.up - 11.0).abs() < 1e-9 && (phases.down - 1.0).abs() < 1e-9);
-        assert!((phases.transport - 5.0).abs() < 1e-9, "{phases:?}");
+        let is = |part: Option<f64>, time: f64| part.is_some_and(|part| (part - time).abs() < 1e-9);
+        assert!(is(phases.up, 11.0) && is(phases.down, 1.0), "{phases:?}");
+        assert!(is(phases.transport, 5.0), "{phases:?}");
         assert_eq!(
             (phases.compute, phases.running, phases.held_up),
             (40.0, 40.0, 7.0)
         );
         assert!((side.rrt.expect("times").p50 - 57.0).abs() < 1e-9);
         assert_eq!(side.times.len(), 20);
+    }
+
+    #[test]
+    fn a_difference_of_two_runs_that_is_not_positive_is_not_shown() {
+        let side = Side::outsourced(&calibration(1.0, 40.0, 20), &asked(38.0), None);
+        let phases = side.phases.expect("phases");
+        assert_eq!((phases.transport, phases.compute), (None, 40.0));
+        let told = serde_json::to_value(phases).expect("plain data");
+        assert!(told["transport"].is_null(), "{told}");
+        // Native requests cross no network.
+        let native = Side::native(&calibration(0.25, 40.0, 20), vec![40.0; 20], &robot());
+        let phases = native.phases.expect("phases");
+        assert_eq!(
+            (phases.up, phases.transport, phases.down),
+            (None, None, None)
+        );
+    }
+
+    #[test]
+    fn what_the_daemon_has_measured_is_kept_where_asking_over_the_network_fails() {
+        let asked = Asked::broken("the daemon broke the connection".into());
+        let side = Side::outsourced(&calibration(1.0, 40.0, 20), &asked, None);
+        assert_eq!(side.phases.map(|phases| phases.compute), Some(40.0));
+        assert_eq!((side.rrt, side.broken), (None, asked.broken));
     }
 }

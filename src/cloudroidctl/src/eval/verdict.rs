@@ -48,6 +48,9 @@ pub struct Evaluation {
     /// What the robot may count on.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sla: Option<Suggested>,
+    /// Why nothing is suggested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub unsuggested: Option<String>,
 }
 
 /// A suggested SLA.
@@ -61,6 +64,10 @@ pub struct Suggested {
     pub has_local: bool,
     /// For the dictionary of the service.
     pub row: Row,
+    /// Whether the row is in the dictionary now.
+    pub written: bool,
+    /// Of its times, what was added for a network that was not there, in milliseconds for each request.
+    pub network_added: f64,
     /// Why these.
     pub reason: String,
 }
@@ -90,12 +97,27 @@ impl Evaluation {
             ..Evaluation::default()
         };
         evaluation.verdict = evaluation.in_words();
-        evaluation.sla = evaluation.suggested(measured.rows.last());
+        match evaluation.suggested(measured.rows.last()) {
+            Ok(sla) => evaluation.sla = Some(sla),
+            Err(why) => evaluation.unsuggested = Some(why),
+        }
         evaluation
     }
 
     fn in_words(&self) -> String {
         let (native, outsourced) = (&self.native, &self.outsourced);
+        if let Some(why) = &outsourced.broken {
+            let at_the_node = outsourced.phases.map_or(String::new(), |phases| {
+                format!(
+                    "; at the node a request takes {:.1} ms (median)",
+                    phases.compute
+                )
+            });
+            return format!(
+                "nothing can be said of it outsourced: asking over the network from here failed: {why}{at_the_node}; evaluate again, \
+                 if it fails again see cloudroidctl events"
+            );
+        }
         let Some(there) = outsourced.rrt else {
             return format!(
                 "outsourced, none of {} requests was answered within 10 s: look whether an input is missing in the recording, or a \
@@ -129,6 +151,7 @@ impl Evaluation {
                 native.requests
             )
         };
+        let worth = format!("{worth}; messages went as they are, without a codec");
         match self.pace {
             Some(pace) if native.rrt.is_some() && !native.keeps(Some(pace)) => format!(
                 "{worth}; the recording asks {pace:.1} times a second, which {}",
@@ -142,11 +165,25 @@ impl Evaluation {
     }
 
     /// What follows from the outsourced times: the row that the daemon proposes for its limits, with the time that was seen from here.
-    fn suggested(&self, proposed: Option<&Row>) -> Option<Suggested> {
-        let (row, rrt) = proposed.zip(self.outsourced.rrt)?;
-        if !self.outsourced.answers_enough() || !self.outsourced.keeps(self.pace) {
-            return None;
+    fn suggested(&self, proposed: Option<&Row>) -> Result<Suggested, String> {
+        const LACKS: &str =
+            "outsourced, too few requests were answered, or not at the recording's pace";
+        if self.outsourced.broken.is_some() {
+            return Err("asking over the network was broken off".to_owned());
         }
+        let measured = proposed.zip(self.outsourced.rrt);
+        let (row, rrt) = measured.ok_or_else(|| LACKS.to_owned())?;
+        if !self.outsourced.answers_enough() || !self.outsourced.keeps(self.pace) {
+            return Err(LACKS.to_owned());
+        }
+        if self
+            .times_as_fast
+            .is_some_and(|factor| factor <= 1.0 / WORTH)
+        {
+            return Err("it is faster on the robot".to_owned());
+        }
+        let phases = self.outsourced.phases.unwrap_or_default();
+        let network_added = phases.up.unwrap_or(0.0) + phases.down.unwrap_or(0.0);
         let desire = rounded_up(rrt.p95) / 1000.0;
         let max = rounded_up(desire * PATIENCE * 1000.0) / 1000.0;
         let row = Row {
@@ -158,20 +195,44 @@ impl Evaluation {
             }),
             ..row.clone()
         };
-        Some(Suggested {
+        Ok(Suggested {
             desire,
             max,
             has_local: self.native.out_of_memory.is_none(),
             reason: format!(
-                "desire is what 95 % of {} outsourced requests took ({:.1} ms), rounded up; max is twice that",
-                self.outsourced.answered, rrt.p95
+                "desire is what 95 % of {} outsourced requests took ({:.1} ms{}), rounded up; max is twice that",
+                self.outsourced.answered,
+                rrt.p95,
+                match network_added > 0.0 {
+                    true => format!(", {network_added:.1} ms of it the added network"),
+                    false => String::new(),
+                }
             ),
             row,
+            written: false,
+            network_added,
         })
     }
 }
 
 impl Suggested {
+    /// Takes the row as it stands among `rows` of the dictionary, where it was written last; numbers of others that promise the same
+    /// limits for the same parameters, as an earlier evaluation wrote them.
+    pub fn note_written(&mut self, rows: &[Row]) -> Vec<i64> {
+        let Some(newest) = rows.iter().max_by_key(|row| row.id) else {
+            return Vec::new();
+        };
+        let same = |row: &&Row| {
+            row.id != newest.id
+                && row.measure == newest.measure
+                && row.aux == newest.aux
+                && row.limits.cpus == newest.limits.cpus
+        };
+        let others = rows.iter().filter(same).map(|row| row.id).collect();
+        (self.row, self.written) = (newest.clone(), true);
+        others
+    }
+
     /// Lines of `stub.toml`.
     pub fn stub_toml(&self) -> Vec<String> {
         let mut lines = vec![
@@ -188,6 +249,7 @@ impl Suggested {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::eval::network::Network;
     use crate::eval::probe::Asked;
     use crate::eval::side::tests::{asked, calibration, robot};
 
@@ -267,6 +329,66 @@ mod tests {
             .sla
             .expect("an SLA");
         assert!(sla.stub_toml()[2].starts_with("local = \"none\""));
+    }
+
+    #[test]
+    fn what_is_not_worth_it_is_not_suggested() {
+        let cloud = calibration(1.0, 40.0, 20);
+        let found = evaluated(native(25.0), &cloud, &asked(50.0));
+        assert!(found.sla.is_none(), "{:?}", found.sla);
+        let why = found.unsuggested.unwrap_or_default();
+        assert!(why.contains("faster on the robot"), "{why}");
+    }
+
+    #[test]
+    fn what_failed_on_the_way_is_told_with_what_was_measured_before() {
+        let cloud = calibration(1.0, 40.0, 20);
+        let found = evaluated(
+            native(200.0),
+            &cloud,
+            &Asked::broken("no bytes came".into()),
+        );
+        for words in [
+            "over the network from here failed: no bytes came",
+            "40.0 ms",
+            "again",
+        ] {
+            assert!(found.verdict.contains(words), "{}", found.verdict);
+        }
+        assert_eq!(found.native.rrt.map(|rrt| rrt.p50), Some(200.0));
+        assert!(found.sla.is_none());
+    }
+
+    #[test]
+    fn a_row_of_the_same_limits_is_named_and_the_added_network_is_told() {
+        let cloud = calibration(1.0, 40.0, 20);
+        let network: Option<Network> = "20".parse().ok();
+        let side = Side::outsourced(&cloud, &asked(50.0), network);
+        let found = Evaluation::new(
+            &cloud,
+            "x.bag".into(),
+            robot(),
+            (native(200.0), side),
+            network,
+        );
+        let mut sla = found.sla.expect("an SLA");
+        assert_eq!(sla.network_added, 20.0);
+        assert!(
+            sla.reason.contains("20.0 ms of it the added network"),
+            "{}",
+            sla.reason
+        );
+        let row = |id, cpus| Row {
+            id,
+            limits: api::Limits {
+                cpus: Some(cpus),
+                ..sla.row.limits.clone()
+            },
+            ..sla.row.clone()
+        };
+        let rows = [row(3, 1.0), row(5, 1.0), row(4, 2.0)];
+        assert_eq!(sla.note_written(&rows), [3]);
+        assert!(sla.written && sla.row.id == 5);
     }
 
     #[test]
