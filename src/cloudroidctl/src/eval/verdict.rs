@@ -382,7 +382,7 @@ mod tests {
             id,
             limits: api::Limits {
                 cpus: Some(cpus),
-                ..sla.row.limits.clone()
+                ..sla.row.limits
             },
             ..sla.row.clone()
         };
