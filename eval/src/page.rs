@@ -33,6 +33,8 @@ tbody th { font-weight: normal; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 thead .number { white-space: normal; }
 figure { margin: 1rem 0 1.5rem; }
+figure.pixels { display: inline-block; width: 48%; min-width: 17rem; vertical-align: top; }
+figure.pixels img { width: 100%; image-rendering: pixelated; }
 figure svg, figure img { display: block; max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
 .drawing { overflow-x: auto; }
 .drawing svg { min-width: 34rem; }
@@ -274,7 +276,12 @@ fn tabulate(page: &mut String, table: &Table) {
 fn picture(page: &mut String, figure: &Figure) {
     let anchor = anchor("figure", &figure.id);
     let caption = escaped(&figure.caption);
-    put(page, format_args!("<figure id=\"{anchor}\">\n"));
+    // Maps stand side by side.
+    let class = match figure.image {
+        Image::Svg(_) => "",
+        Image::Png(_) => " class=\"pixels\"",
+    };
+    put(page, format_args!("<figure id=\"{anchor}\"{class}>\n"));
     match &figure.image {
         Image::Svg(text) => match drawing(text) {
             Some(svg) => put(

@@ -17,9 +17,7 @@ pub use figures::{
 pub use models::{Point, RrtModel};
 pub use paths::{TrajectoryError, trajectory_error};
 pub use pictures::psnr;
-pub use queues::{
-    Closed, Node, Observed, machine_repair, nodes_needed, response, robots_per_node, waiting_time,
-};
+pub use queues::{Closed, Node, Observed, machine_repair, response, robots_per_node};
 pub use random::Xorshift;
 
 #[cfg(test)]

@@ -1,13 +1,18 @@
 //! Parts of the project's benchmarks that an experiment needs: their programs are run, and what they write is read.
 
 use std::process::Command;
+use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 use support::binaries;
 
 use crate::cells::{Cells, Measured};
+use crate::deadline;
 use crate::words::digits;
+
+/// For one part of a benchmark, which takes some minutes.
+const LONGEST: Duration = Duration::from_secs(900);
 
 /// What a benchmark writes: `bench_report::Report`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -77,7 +82,8 @@ pub fn part(cells: &Cells, name: &str, arguments: &[&str]) -> Result<Measured<Wr
             "{} is not built: make eval builds it",
             program.display()
         );
-        let status = Command::new(&program).args(arguments).status()?;
+        let mut child = Command::new(&program).args(arguments).spawn()?;
+        let status = deadline::ends(&mut child, &program.display().to_string(), LONGEST)?;
         ensure!(
             status.success(),
             "{} ended with {status}",

@@ -1,16 +1,4 @@
-//! Queues: how long robots wait for each other, and how many nodes they need.
-
-/// How long a request waits before it is served, seconds, on one server with Poisson arrivals: Pollaczek and Khinchine's
-/// formula for M/G/1 (Kleinrock, "Queueing Systems", volume 1, 1975, chapter 5). `arrivals` are requests per second,
-/// `service` is the mean time of service in seconds, `variation` the variance of that time divided by the square of its
-/// mean: 0 for equal times (M/D/1), 1 for exponential ones (M/M/1). Infinite if more arrives than can be served.
-pub fn waiting_time(arrivals: f64, service: f64, variation: f64) -> f64 {
-    let busy = arrivals * service;
-    if busy >= 1.0 {
-        return f64::INFINITY;
-    }
-    busy * service * (1.0 + variation) / (2.0 * (1.0 - busy))
-}
+//! Queues: how long robots wait for each other, and how many of them a node serves in time.
 
 /// How a node serves robots that each have one request at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -88,16 +76,6 @@ pub fn robots_per_node(robots: u64, cores: f64, service: f64, think: f64, t_max:
         }
     }
     enough
-}
-
-/// How many nodes of `cores_per_node` serve `robots` so that their mean response time is at most `t_max` seconds, if
-/// each node has its own robots. `u64::MAX` if no number of nodes does, because one robot alone waits longer.
-pub fn nodes_needed(robots: u64, cores_per_node: f64, service: f64, think: f64, t_max: f64) -> u64 {
-    match robots_per_node(robots, cores_per_node, service, think, t_max) {
-        _ if robots == 0 => 0,
-        0 => u64::MAX,
-        each => robots.div_ceil(each),
-    }
 }
 
 /// What was measured of robots at a node.
@@ -214,15 +192,6 @@ mod tests {
     use super::super::near;
     use super::*;
 
-    /// Half busy, service of 1 s: M/M/1 waits 1 s, M/D/1 half of that.
-    #[test]
-    fn waiting_follows_pollaczek_and_khinchine() {
-        near(waiting_time(0.5, 1.0, 1.0), 1.0);
-        near(waiting_time(0.5, 1.0, 0.0), 0.5);
-        assert_eq!(waiting_time(1.0, 1.0, 0.0), f64::INFINITY);
-        assert_eq!(waiting_time(0.0, 1.0, 1.0), 0.0);
-    }
-
     /// Exact Mean Value Analysis of one core (Reiser and Lavenberg, 1980): who arrives finds what the queue is without them.
     fn one_core(robots: u64, service: f64, think: f64) -> f64 {
         let (mut response, mut length) = (0.0, 0.0);
@@ -266,14 +235,9 @@ mod tests {
 
     /// One core, 1 s of service, 1 s of pause: one robot waits 1 s, two wait 1.5 s, three wait 1 + 0.8 · 1.5 = 2.2 s.
     #[test]
-    fn nodes_are_counted() {
+    fn robots_that_are_served_in_time_are_counted() {
         near(response(3, 1.0, 1.0, 1.0), 2.2);
         assert_eq!(robots_per_node(100, 1.0, 1.0, 1.0, 1.6), 2);
-        assert_eq!(nodes_needed(5, 1.0, 1.0, 1.0, 1.6), 3);
-        assert_eq!(nodes_needed(100_000, 1.0, 1.0, 1.0, 2.2 + 1e-9), 33_334);
-        assert_eq!(nodes_needed(5, 1.0, 1.0, 1.0, 0.5), u64::MAX);
-        assert_eq!(nodes_needed(0, 1.0, 1.0, 1.0, 0.5), 0);
-        assert_eq!(nodes_needed(7, 1.0, 1.0, 1.0, 1e9), 1);
     }
 
     const NODE: Node = Node {

@@ -3,11 +3,11 @@
 use super::sources::Alone;
 use super::told::{base, done, encoded, lan, saving};
 use super::{Kind, Runs, Sent, Setting, What};
-use crate::statistics::quantile;
+use crate::statistics::{median, median_interval};
 use crate::words::digits;
 
-/// Times as long is longer, and no chance.
-const SLOWER: f64 = 1.05;
+/// Of the medians' intervals, which must not overlap where one is called longer than the other.
+const CONFIDENCE: f64 = 0.95;
 
 pub(super) fn findings(runs: &Runs) -> Vec<String> {
     let mut findings: Vec<String> = lan(runs)
@@ -48,7 +48,7 @@ fn as_they_are(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
     let plain = sent.each.len() - encoded(runs, what, sent)?;
     (plain > 0).then(|| {
         format!(
-            "{}, codec {}, {}: {plain} of {} messages went as they are, so that less is saved than the codec can save: the link encodes only once it has measured itself, and while that is less than 60 MB/s.",
+            "{}, codec {}, {}: {plain} of {} messages took nine tenths of the bytes or more: the link sent them as they are, which it does until it has measured itself and where it is quick, or the codec saves less than a tenth of them.",
             what.kind.name(),
             what.setting.name(),
             what.network.name(),
@@ -58,9 +58,12 @@ fn as_they_are(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
 }
 
 fn slower(runs: &Runs, what: &What, sent: &Sent) -> Option<String> {
-    let median = |sent: &Sent| quantile(&sent.responses, 0.5);
-    let (with, without) = median(sent).zip(median(base(runs, what)?.1))?;
-    (with > SLOWER * without).then(|| {
+    let plain = base(runs, what)?.1;
+    let [with, without] = [sent, plain].map(|sent| median(&sent.responses));
+    let (with, without) = with.zip(without)?;
+    let interval = |sent: &Sent| median_interval(&sent.responses, CONFIDENCE);
+    let ((low, _), (_, high)) = interval(sent).zip(interval(plain))?;
+    (low > high).then(|| {
         format!(
             "{}, codec {}, {}: a message takes longer with the codec ({} ms) than without ({} ms): encoding and decoding take more time than the network needs for what they save.",
             what.kind.name(),
@@ -83,7 +86,7 @@ fn larger_than_deflate(kind: Kind, alone: &Alone) -> Option<String> {
     });
     (ours.bytes[1] > published.bytes[1] || alone.known.is_some()).then(|| {
         format!(
-            "{}: the codec {} makes {} bytes of a message where {} makes {}.{known}",
+            "{}: the codec {} makes {} bytes of the same messages of which {} makes {}.{known}",
             kind.name(),
             ours.codec,
             ours.bytes[1],

@@ -15,6 +15,7 @@ use support::binaries;
 use support::daemon::Daemon;
 
 use super::{CLASS, PACKAGE, Sources, What, plan};
+use crate::deadline;
 use crate::place::Place;
 use crate::recording::{Recording, header};
 use crate::robot::{FIRST, WARM_UP};
@@ -22,6 +23,8 @@ use crate::statistics::psnr;
 
 /// Between two tries to record a servant that is not there yet.
 const AGAIN: Duration = Duration::from_millis(200);
+/// For a recording to end that was asked to.
+const END: Duration = Duration::from_secs(60);
 /// Bytes of a picture.
 const PIXELS: usize = 640 * 480 * 3;
 
@@ -109,6 +112,8 @@ fn records(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
             std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
             return Ok(child);
         }
+        // Whatever else it said, it does not record.
+        let _ = child.kill();
         child.wait()?;
         ensure!(
             !over.load(Ordering::Relaxed),
@@ -122,7 +127,7 @@ fn records(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
 /// Ends the recording as Ctrl-C does.
 fn ends(mut child: Child) -> Result<()> {
     kill(Pid::from_raw(i32::try_from(child.id())?), Signal::SIGINT)?;
-    let status = child.wait()?;
+    let status = deadline::ends(&mut child, "cloudroidctl record", END)?;
     ensure!(status.success(), "cloudroidctl record ended with {status}");
     Ok(())
 }

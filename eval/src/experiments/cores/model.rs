@@ -1,7 +1,6 @@
 //! Response times as sums of parts, each of which is modelled by itself: the greater part of a response may be work that cores share, and the
 //! rest is not.
 
-use crate::place::Cost;
 use crate::statistics::{Point, RrtModel, mean};
 use crate::trace::Trace;
 
@@ -38,11 +37,6 @@ pub fn parts(trace: &Trace) -> Option<Parts> {
         *part = mean(&all.iter().map(|one| one[index]).collect::<Vec<_>>())?;
     }
     Some(means)
-}
-
-/// Bytes of a request and its answer on the network, by counting packets.
-pub fn bytes(trace: &Trace, cost: &Cost) -> f64 {
-    (cost.sent + cost.received) as f64 / trace.requests.len().max(1) as f64
 }
 
 /// One model for each part.
@@ -145,12 +139,6 @@ mod tests {
         for (one, other) in found.into_iter().zip([0.01, 0.5, 0.02, 0.07]) {
             near(one, other);
         }
-        let cost = Cost {
-            sent: 500,
-            received: 100,
-            ..Cost::default()
-        };
-        near(bytes(&trace, &cost), 200.0);
     }
 
     #[test]

@@ -249,9 +249,13 @@ impl Runs {
         }
         let used = |policy| self.at(policy, most).map(|beside| beside.neighbours_cores);
         if let (Some(limits), Some(weights)) = (used(Policy::Limits), used(Policy::Weights)) {
+            let idle = if weights > limits {
+                "; what the robot does not use is left idle with limits"
+            } else {
+                "; here nothing was left idle for that"
+            };
             section.findings.push(format!(
-                "What limits cost: {most} neighbours used {} cores with limits and {} with weights only; what the robot does not use \
-                 is then left idle.",
+                "What limits cost: {most} neighbours used {} cores with limits and {} with weights only{idle}.",
                 digits(limits),
                 digits(weights)
             ));
