@@ -201,7 +201,7 @@ impl Probe<'_> {
 
 /// After which a request is made again that nobody may have heard.
 fn again(calibration: &Calibration) -> Duration {
-    let longest = super::point(calibration).compute;
+    let longest = super::measure::point(calibration).compute;
     let longest = longest.map_or(0.0, |compute| compute.max);
     AGAIN + Duration::from_secs_f64(longest * 2.0 / 1000.0).min(ANSWER)
 }

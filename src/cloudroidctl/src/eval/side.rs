@@ -4,8 +4,8 @@ use api::calibration::TimeSpread;
 use api::{Calibration, Size};
 use serde::Serialize;
 
+use super::measure::point;
 use super::network::Network;
-use super::point;
 use super::probe::Asked;
 use super::robot::Robot;
 
