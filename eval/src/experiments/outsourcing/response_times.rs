@@ -1,0 +1,218 @@
+//! Experiment 2: response times natively and outsourced, and how many times as fast.
+
+use anyhow::Result;
+
+use super::{Run, SetUp, find, missing};
+use crate::examples::ALL;
+use crate::place::Network;
+use crate::plots::{self, Series};
+use crate::section::{Section, Table};
+use crate::statistics::{mean, quantile};
+use crate::trace::Trace;
+use crate::words::{known, milliseconds, ratio};
+
+/// The largest factor in the publication's Fig. 5.
+const PUBLISHED: u32 = 25;
+
+/// Experiment 2.
+pub fn response_times(runs: &[Run]) -> Result<Section> {
+    let mut section = Section::new(
+        2,
+        "outsourcing",
+        "Native and outsourced, on two kinds of robots",
+    );
+    section.published = "Fig. 5 of the publication: response times per request and accumulated times of RGBD-SLAM, RTAB-Map and SSD on a \
+        Raspberry Pi and on an ultrabook, native and outsourced: outsourced they were up to 25 times as fast."
+        .to_owned();
+    section.differs = differs();
+    let network = runs
+        .iter()
+        .find_map(|run| Some(&run.measured.done()?.1.network));
+    section
+        .differs
+        .extend(network.map(|network| format!("Packets are delayed by {network}.")));
+    let mut table = Table::new(
+        "Response times, from publishing a request to its answer (milliseconds), one request after the other",
+        [
+            "package",
+            "robot",
+            "where",
+            "requests",
+            "answered",
+            "median",
+            "95 %",
+            "accumulated (s)",
+            "times as fast, by medians",
+            "times as fast, by means",
+            "published",
+            "robot's CPU, whole run (s)",
+            "bytes a request, both ways",
+        ],
+    );
+    for run in runs {
+        let Some((trace, cost)) = run.measured.done() else {
+            continue;
+        };
+        let responses = trace.responses();
+        let native = find(runs, run.example.name, run.class, SetUp::Native);
+        let native = native.map(|(trace, _)| trace.responses());
+        let median = quantile(&responses, 0.5);
+        let times =
+            |of: &dyn Fn(&[f64]) -> Option<f64>| Some(of(native.as_ref()?)? / of(&responses)?);
+        let faster = times(&|all| quantile(all, 0.5));
+        table.push([
+            run.example.name.to_owned(),
+            run.class.name().to_owned(),
+            run.set_up.name().to_owned(),
+            trace.requests.len().to_string(),
+            trace.answered().to_string(),
+            milliseconds(median),
+            milliseconds(quantile(&responses, 0.95)),
+            format!("{:.1}", responses.iter().sum::<f64>()),
+            ratio(faster),
+            ratio(times(&|all| mean(all))),
+            published(run.set_up),
+            format!("{:.1}", cost.robot_cpu),
+            known(trace.carried_each(1), |ways| {
+                format!("{:.0}", ways[0] + ways[1])
+            }),
+        ]);
+        if let (Some(faster), SetUp::Behind(network)) = (faster, run.set_up) {
+            section.findings.push(finding(run, network, faster));
+        }
+        let lost = trace.requests.len() - trace.answered();
+        if lost > 0 {
+            section.findings.push(format!(
+                "{}, {}, {}: {lost} of {} requests were never answered, and times are those of the others.",
+                run.example.name,
+                run.class.name(),
+                run.set_up.name(),
+                trace.requests.len()
+            ));
+        }
+    }
+    section.tables.push(table);
+    for example in ALL {
+        let series = |of: fn(&Trace) -> Vec<(f64, f64)>| -> Vec<Series> {
+            let done = runs.iter().filter(|run| run.example.name == example.name);
+            let one = |run: &Run| {
+                Some(Series {
+                    name: format!("{}, {}", run.class.name(), run.set_up.name()),
+                    points: of(&run.measured.done()?.0),
+                })
+            };
+            done.filter_map(one).collect()
+        };
+        let title = format!("{} (stands for {})", example.name, example.stands_for);
+        section.drawing(
+            format!("outsourcing-{}", example.name),
+            format!("{title}: response time of each request"),
+            plots::lines(&title, "request", "response time (s)", &series(each), true)?,
+        );
+        section.drawing(
+            format!("outsourcing-{}-accumulated", example.name),
+            format!("{title}: accumulated response times"),
+            plots::lines(
+                &title,
+                "request",
+                "accumulated response times (s)",
+                &series(accumulated),
+                false,
+            )?,
+        );
+    }
+    missing(&mut section, runs);
+    Ok(section)
+}
+
+/// How many times as fast as on the robot the publication's packages were (Fig. 5), of which its largest number is known to us.
+fn published(set_up: SetUp) -> String {
+    match set_up {
+        SetUp::Native => "1".to_owned(),
+        SetUp::Behind(_) => format!("up to {PUBLISHED}"),
+    }
+}
+
+fn differs() -> Vec<String> {
+    [
+        "The published packages are not packaged for this system: laser_slam (scan matching), graph_slam (a graph of poses, whose steps take longer as it grows) and object_detector (a neural network) stand in; the SLAM packages work on a recorded drive of MRPT.",
+        "A Raspberry Pi is a quarter of a core of this machine and 1 GiB, an ultrabook half a core and 4 GiB; the cloud has one core for each servant. With that few cores no factor of 25 can come about: one core is four times a quarter.",
+        &format!(
+            "Networks are delays, rates and losses between two namespaces of this machine (LAN: {}; WAN: {}).",
+            Network::Lan.told(),
+            Network::Wan.told()
+        ),
+        "The model of cores beside this predicts means, because only means follow a limit of a fraction of a core: the column by means is to be compared with it.",
+    ]
+    .map(str::to_owned)
+    .to_vec()
+}
+
+fn finding(run: &Run, network: Network, faster: f64) -> String {
+    let (name, class, network) = (run.example.name, run.class.name(), network.name());
+    if faster >= 1.0 {
+        return format!(
+            "{name} answers {faster:.1} times as fast outsourced by {network} as on a robot of the class {class}."
+        );
+    }
+    format!(
+        "{name} answers more slowly outsourced by {network} than on a robot of the class {class} ({faster:.2} times as fast): the way to the cloud and back takes longer than what its processor saves."
+    )
+}
+
+fn each(trace: &Trace) -> Vec<(f64, f64)> {
+    let known = (1..).zip(&trace.requests);
+    let point =
+        |(number, one): (u32, &crate::trace::Request)| Some((f64::from(number), one.response?));
+    known.filter_map(point).collect()
+}
+
+fn accumulated(trace: &Trace) -> Vec<(f64, f64)> {
+    let mut sum = 0.0;
+    let add = |(number, response)| {
+        sum += response;
+        (number, sum)
+    };
+    each(trace).into_iter().map(add).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiments::outsourcing::tests::run;
+
+    #[test]
+    fn how_much_faster_is_by_the_medians() {
+        let runs = [
+            run(SetUp::Native, &[0.3, 0.4, 0.5]),
+            run(SetUp::Behind(Network::Lan), &[0.1, 0.1, 0.9]),
+            run(SetUp::Behind(Network::Wan), &[0.8, 0.8, 0.8]),
+        ];
+        let section = response_times(&runs).expect("a section");
+        let faster: Vec<&str> = section.tables[0]
+            .rows
+            .iter()
+            .map(|row| row[8].as_str())
+            .collect();
+        assert_eq!(faster, ["1.0", "4.0", "0.50"]);
+        assert_eq!(section.tables[0].rows[1][9], "1.1");
+        assert_eq!(section.tables[0].rows[1][10], "up to 25");
+        assert!(
+            section.findings[0].contains("4.0 times as fast"),
+            "{:?}",
+            section.findings
+        );
+        assert!(
+            section.findings[1].contains("more slowly"),
+            "{:?}",
+            section.findings
+        );
+    }
+
+    #[test]
+    fn accumulated_times_are_sums() {
+        let Run { measured, .. } = run(SetUp::Native, &[1.0, 2.0, 3.0]);
+        let sums = accumulated(&measured.done().expect("it is").0);
+        assert_eq!(sums, [(1.0, 1.0), (2.0, 3.0), (3.0, 6.0)]);
+    }
+}
