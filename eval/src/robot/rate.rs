@@ -6,7 +6,10 @@ use anyhow::{Result, ensure};
 use support::site::Running;
 use tokio::time::Instant as At;
 
-use super::{Ends, FIRST, Plan, WARM_UP, answered, let_go, number_of};
+use super::answers::{answered, number_of};
+use super::asking::let_go;
+use super::ends::Ends;
+use super::{FIRST, Plan, WARM_UP};
 use crate::place::asks_for;
 use crate::recording::Step;
 use crate::trace::{Request, Trace};
