@@ -1,48 +1,15 @@
 //! The report as one HTML file: nothing is fetched and nothing is run, so it can be sent as it is.
 
-use crate::section::{Figure, Image, Missing, Section, Table};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+mod figures;
+mod style;
+mod tables;
+
 use std::fmt::Write;
 
-/// Light and dark as the reader's system is. Drawings keep their white ground.
-const STYLE: &str = "\
-:root { color-scheme: light dark; --ground: #fff; --ink: #1b1f24; --quiet: #57606a; --line: #d0d7de; --box: #f6f8fa; --link: #0550ae; --warn: #b35900; }
-@media (prefers-color-scheme: dark) {
-  :root { --ground: #14171c; --ink: #e6e8eb; --quiet: #9aa4b0; --line: #3a424c; --box: #1d2229; --link: #7db8ff; --warn: #e69f00; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 64rem; padding: 1rem; background: var(--ground); color: var(--ink); font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: break-word; }
-h1 { font-size: 1.6rem; line-height: 1.25; }
-h2 { font-size: 1.3rem; line-height: 1.3; margin-top: 2.5rem; }
-h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
-a { color: var(--link); }
-p, li, figcaption { max-width: 48rem; }
-p, ul { margin: 0.25rem 0 0.75rem; }
-ul { padding-left: 1.25rem; }
-nav ul { list-style: none; padding: 0; }
-nav h2 { margin-top: 1rem; }
-small, header p, caption, figcaption { color: var(--quiet); }
-main > section { border-top: 1px solid var(--line); }
-.table { overflow-x: auto; margin: 0.75rem 0 1.25rem; }
-table { border-collapse: collapse; font-size: 0.9rem; }
-caption { text-align: left; padding-bottom: 0.25rem; }
-th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.75rem 0.3rem 0; text-align: left; vertical-align: top; min-width: 4rem; overflow-wrap: normal; }
-thead th { background: var(--box); }
-tbody th { font-weight: normal; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-thead .number { white-space: normal; }
-figure { margin: 1rem 0 1.5rem; }
-figure.pixels { display: inline-block; width: 48%; min-width: 17rem; vertical-align: top; }
-figure.pixels img { width: 100%; image-rendering: pixelated; }
-figure svg, figure img { display: block; max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
-.drawing { overflow-x: auto; }
-.drawing svg { min-width: 34rem; }
-figcaption { font-size: 0.9rem; margin-top: 0.35rem; }
-.missing { border-left: 4px solid var(--warn); background: var(--box); padding: 0.1rem 1rem; margin: 1rem 0; }
-.missing h3 { margin-top: 0.75rem; }
-@media print { main > section { break-before: page; } .table { overflow: visible; } }
-";
+use crate::section::{Missing, Section, Table};
+use figures::picture;
+use style::STYLE;
+use tables::tabulate;
 
 /// The page. `machine` is where it was measured, `made` when; `reproduced` lists what could not be reproduced here, its
 /// stand-in, and the reason.
@@ -215,144 +182,10 @@ fn missing(page: &mut String, missing: &[Missing]) {
     page.push_str("</ul>\n</div>\n");
 }
 
-/// A cell that is read as a number.
-fn is_number(cell: &str) -> bool {
-    let digits = cell.trim_start_matches(['-', '−', '+', '<', '>', '≤', '≥', '~', ' ']);
-    digits.starts_with(|first: char| first.is_ascii_digit())
-}
-
-/// The box can be scrolled by keyboard, too, because it can have the focus.
-fn tabulate(page: &mut String, table: &Table) {
-    put(
-        page,
-        format_args!(
-            "<div class=\"table\" role=\"region\" tabindex=\"0\" aria-label=\"{caption}\">\n<table>\n<caption>{caption}</caption>\n<thead><tr>",
-            caption = escaped(&table.caption)
-        ),
-    );
-    // A column is aligned to the right if every cell that says something is a number.
-    let numbers: Vec<bool> = (0..table.head.len())
-        .map(|column| {
-            let cells = table.rows.iter().filter_map(|row| row.get(column));
-            let mut said = cells.filter(|cell| !matches!(cell.as_str(), "" | "-" | "–" | "—"));
-            column > 0 && said.all(|cell| is_number(cell))
-        })
-        .collect();
-    let class = |column: usize| match numbers.get(column) {
-        Some(true) => " class=\"number\"",
-        _ => "",
-    };
-    for (column, name) in table.head.iter().enumerate() {
-        put(
-            page,
-            format_args!("<th scope=\"col\"{}>{}</th>", class(column), escaped(name)),
-        );
-    }
-    page.push_str("</tr></thead>\n<tbody>\n");
-    for row in &table.rows {
-        page.push_str("<tr>");
-        for (column, cell) in row.iter().enumerate() {
-            let cell = escaped(cell);
-            if column == 0 {
-                put(page, format_args!("<th scope=\"row\">{cell}</th>"));
-            } else {
-                put(page, format_args!("<td{}>{cell}</td>", class(column)));
-            }
-        }
-        page.push_str("</tr>\n");
-    }
-    if table.rows.is_empty() {
-        put(
-            page,
-            format_args!(
-                "<tr><td colspan=\"{}\">nothing was measured</td></tr>\n",
-                table.head.len().max(1)
-            ),
-        );
-    }
-    page.push_str("</tbody>\n</table>\n</div>\n");
-}
-
-fn picture(page: &mut String, figure: &Figure) {
-    let anchor = anchor("figure", &figure.id);
-    let caption = escaped(&figure.caption);
-    // Maps stand side by side.
-    let class = match figure.image {
-        Image::Svg(_) => "",
-        Image::Png(_) => " class=\"pixels\"",
-    };
-    put(page, format_args!("<figure id=\"{anchor}\"{class}>\n"));
-    match &figure.image {
-        Image::Svg(text) => match drawing(text) {
-            Some(svg) => put(
-                page,
-                format_args!(
-                    "<div class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{svg}</div>\n"
-                ),
-            ),
-            None => embed(page, "image/svg+xml", text.as_bytes(), &caption),
-        },
-        Image::Png(bytes) => embed(page, "image/png", bytes, &caption),
-    }
-    put(
-        page,
-        format_args!("<figcaption>{caption}</figcaption>\n</figure>\n"),
-    );
-}
-
-fn embed(page: &mut String, kind: &str, bytes: &[u8], caption: &str) {
-    put(
-        page,
-        format_args!(
-            "<img src=\"data:{kind};base64,{}\" alt=\"{caption}\">\n",
-            STANDARD.encode(bytes)
-        ),
-    );
-}
-
-/// The element of an SVG document that consists of shapes and text alone, as ours do. Any other becomes an image, in
-/// which a browser runs and fetches nothing.
-fn drawing(text: &str) -> Option<&str> {
-    const SHAPES: [&str; 11] = [
-        "svg", "g", "rect", "circle", "ellipse", "line", "polyline", "polygon", "path", "text",
-        "tspan",
-    ];
-    let svg = text.find("<svg").map(|at| text[at..].trim_end())?;
-    if !svg.ends_with("</svg>") && !svg.ends_with("/>") {
-        return None;
-    }
-    let mut depth = 0usize;
-    for (number, tag) in svg.split('<').skip(1).enumerate() {
-        let tag = tag.split_once('>')?.0;
-        let name = tag.trim_matches('/').split_whitespace().next()?;
-        let whole = !tag.contains('\'') && tag.matches('"').count() % 2 == 0;
-        let outside = number > 0 && depth == 0;
-        if !SHAPES.contains(&name) || !whole || outside || tag.split('=').any(acts) {
-            return None;
-        }
-        if tag.starts_with('/') {
-            depth = depth.checked_sub(1)?;
-        } else if !tag.ends_with('/') {
-            depth += 1;
-        }
-    }
-    (depth == 0).then_some(svg)
-}
-
-/// Whether what stands before a `=` ends with the name of an attribute that runs or fetches something.
-fn acts(before: &str) -> bool {
-    let name = before
-        .trim_end()
-        .rsplit(|character: char| !character.is_ascii_alphanumeric())
-        .next()
-        .unwrap_or_default()
-        .to_ascii_lowercase();
-    name.starts_with("on") || name == "href" || name == "style" || before.contains("url(")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::section::Figure;
 
     const EVIL: &str = "<script>alert(\"1\")</script> & 'x'\u{0}";
 
