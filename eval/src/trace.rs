@@ -67,6 +67,9 @@ pub struct Trace {
     pub requests: Vec<Request>,
     /// Seconds from the first request to the last answer.
     pub lasted: f64,
+    /// Of requests at a rate: answers were late already before the first that counts.
+    #[serde(default)]
+    pub late_before: bool,
     /// The last map.
     pub map: Option<Grid>,
     /// Answers by the local original, where that is known.

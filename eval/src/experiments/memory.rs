@@ -5,6 +5,7 @@ use anyhow::Result;
 use crate::cells::{Cells, Measured};
 use crate::examples::{DETECTOR, Example, Where, Workshop};
 use crate::place::{Class, Cost, Network, Place};
+use crate::robot::Node;
 use crate::section::{Missing, Section, Table};
 use crate::statistics::quantile;
 use crate::trace::Trace;
@@ -34,6 +35,10 @@ pub fn measure(cells: &Cells, workshop: &Workshop) -> Result<Runs> {
             workshop.publishes(&detector)?;
             let directory = workshop.directory()?;
             let mut plan = workshop.plan(&detector, at, directory.path())?;
+            if let Node::Stub { settings, .. } = &mut plan.node {
+                // A robot of its own: parameters that a node has set stay with its robot's servant, as they stay with a ROS Master.
+                settings.push_str("\nrobot = \"large-pictures\"");
+            }
             plan.most = REQUESTS;
             plan.patience = 240.0;
             let place = Place::new(&workshop.daemon.address, Class::PI, Network::Lan)?;

@@ -255,6 +255,18 @@ fn findings(runs: &Runs) -> Vec<String> {
             requests.len()
         ));
     }
+    for run in &runs.runs {
+        if run
+            .measured
+            .done()
+            .is_some_and(|(trace, _)| trace.late_before)
+        {
+            findings.push(format!(
+                "{}: answers were late already before the first request that counts: the machine was busy, or the package is too slow for this rate.",
+                run.set_up.name()
+            ));
+        }
+    }
     if let (Some((_, stub)), Some((_, cloud))) = (of(SetUp::Stub), of(SetUp::Cloud)) {
         let both = within(stub).zip(within(cloud));
         if both.is_some_and(|(stub, cloud)| stub <= cloud) {
@@ -342,13 +354,20 @@ mod tests {
     #[test]
     fn a_stub_that_did_not_help_is_told() {
         let same = [Some(0.2), None, Some(0.3), Some(0.2)];
-        let section = section(&runs(vec![
+        let mut all = vec![
             run(SetUp::Stub, &same, false),
             run(SetUp::Cloud, &same, false),
             run(SetUp::Local, &[Some(0.2); 4], false),
-        ]))
-        .expect("a section");
+        ];
+        if let Measured::Done((trace, _)) = &mut all[1].measured {
+            trace.late_before = true;
+        }
+        let section = section(&runs(all)).expect("a section");
         let told = section.findings.join(" ");
+        assert!(
+            told.contains("cloud alone: answers were late already"),
+            "{told}"
+        );
         assert!(told.contains("did not help"), "{told}");
         assert!(
             told.contains("25.0 percentage points more of the requests"),
