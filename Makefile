@@ -176,7 +176,7 @@ ifneq ($(QUICK),)
 eval: eval-quick
 else
 eval: test-deps build ## the published experiments on this machine, with a report; QUICK=1: few requests; ONLY=2,7; FRESH=1: all anew (as root)
-	@scripts/deps build run test eval
+	@scripts/deps build run test eval engines
 	@cargo build --locked --release -p eval $(EVAL_BENCHES:%=-p bench-%)
 	@cargo build --locked --release -p cloudroidd --features video
 	@cargo build --locked --profile stub -p cloudroid-stub --features video

@@ -63,7 +63,7 @@ fn needed<'a>(
                 section.missing.push(Missing::new(
                     &one.what,
                     &one.why,
-                    "scripts/deps eval installs it",
+                    "scripts/deps engines installs it",
                 ));
             }
             section.findings.extend(written.unmet());

@@ -4,8 +4,9 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use ros::bus::Message;
+use tokio::time::Instant as At;
 
-use super::boxes;
+use super::{FIRST, boxes};
 use crate::recording::{header, numbers, pose};
 use crate::trace::{Grid, Request};
 
@@ -18,6 +19,18 @@ pub(super) fn answered(request: &mut Request, message: &Message, after: Duration
     request.digest = Some(digest(&message.bytes));
     request.boxes = boxes::digest(message);
     request.pose = pose(&message.bytes);
+}
+
+/// Puts an answer to its request, of those that were `sent` then; the first one counts.
+pub(super) fn note(requests: &mut [Request], sent: &[At], message: &Message) {
+    let index = number_of(message).and_then(|number| number.checked_sub(FIRST));
+    let index = index.map_or(usize::MAX, |index| index as usize);
+    if let (Some(request), Some(sent)) = (requests.get_mut(index), sent.get(index)) {
+        request.answers += 1;
+        if request.response.is_none() {
+            answered(request, message, sent.elapsed());
+        }
+    }
 }
 
 /// Of a message without its header's sequence number.

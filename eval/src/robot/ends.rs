@@ -9,7 +9,7 @@ use ros::ros1::Ros1Bus;
 use support::site::{Running, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
-use super::answers::{answered, grid, number_of};
+use super::answers::{grid, note, number_of};
 use super::asking::{LOOK, has_ended};
 use super::{FIRST, Plan};
 use crate::recording::{Recording, Step, header, numbers, restamped, stamped_before};
@@ -103,16 +103,7 @@ impl Ends {
                 Some(message) = self.answers.messages.recv() => message,
                 () = sleep_until(until) => return,
             };
-            let index = number_of(&message).and_then(|number| number.checked_sub(FIRST));
-            let Some(index) = index.map(|index| index as usize) else {
-                continue;
-            };
-            if let Some(request) = requests.get_mut(index) {
-                request.answers += 1;
-                if request.response.is_none() {
-                    answered(request, &message, sent[index].elapsed());
-                }
-            }
+            note(requests, sent, &message);
         }
     }
 

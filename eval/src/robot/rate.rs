@@ -6,7 +6,7 @@ use anyhow::Result;
 use support::site::Running;
 use tokio::time::Instant as At;
 
-use super::answers::{answered, number_of};
+use super::answers::note;
 use super::asking::let_go;
 use super::ends::Ends;
 use super::{FIRST, Plan, WARM_UP};
@@ -81,16 +81,7 @@ impl Ends {
             let Ok(Some(message)) = waited.await else {
                 return;
             };
-            let index = number_of(&message).and_then(|number| number.checked_sub(FIRST));
-            let Some(index) = index.map(|index| index as usize) else {
-                continue;
-            };
-            if let Some(request) = requests.get_mut(index) {
-                request.answers += 1;
-                if request.response.is_none() {
-                    answered(request, &message, sent[index].elapsed());
-                }
-            }
+            note(requests, sent, &message);
         }
     }
 }
