@@ -1,0 +1,255 @@
+//! Moves datagrams between sockets and the engine, and calls it when its time comes. One task for each participant.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+use rustix::time::{
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create,
+    timerfd_settime,
+};
+use socket2::SockRef;
+use tokio::io::unix::AsyncFd;
+use tokio::net::UdpSocket;
+use tokio::sync::Notify;
+
+use crate::engine::{Datagram, Engine};
+use crate::flow::Flow;
+
+/// A receiver without room is looked at again after this time. Timers of tokio count in milliseconds, in which a receiver's buffer
+/// runs empty several times; hence a timer of the kernel.
+const LOOK_AGAIN: Timespec = Timespec {
+    tv_sec: 0,
+    tv_nsec: 60_000,
+};
+/// How often it is looked which ports are bound.
+const PORTS: Duration = Duration::from_millis(200);
+/// Datagrams that are taken at once from one socket, before others have their turn.
+const AT_ONCE: usize = 32;
+/// The longest datagram.
+const LONGEST: usize = 65_536;
+/// A shorter datagram is copied out of the buffer, a longer one takes the buffer with it.
+const COPIED: usize = 16 << 10;
+
+/// What is locked together.
+pub(crate) struct Core {
+    pub engine: Engine,
+    flow: Flow,
+    /// A datagram for which the sending socket had no room.
+    stalled: Option<Datagram>,
+}
+
+/// What a participant, its ends and its task share.
+pub(crate) struct Shared {
+    core: Mutex<Core>,
+    wake: Notify,
+    /// Where ends are announced.
+    discovery: UdpSocket,
+    /// Where samples come in, and all goes out.
+    user: UdpSocket,
+    /// Where participants announce themselves to all.
+    multicast: Option<UdpSocket>,
+}
+
+/// Why something waits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Waits {
+    Nothing,
+    /// Receivers have no room.
+    Receivers,
+    /// The sending socket has none.
+    Socket,
+}
+
+impl Shared {
+    pub fn new(
+        engine: Engine,
+        flow: Flow,
+        discovery: UdpSocket,
+        user: UdpSocket,
+        multicast: Option<UdpSocket>,
+    ) -> Arc<Self> {
+        let core = Mutex::new(Core {
+            engine,
+            flow,
+            stalled: None,
+        });
+        Arc::new(Self {
+            core,
+            wake: Notify::new(),
+            discovery,
+            user,
+            multicast,
+        })
+    }
+
+    /// Does something with the engine, and sends at once what can be sent.
+    pub fn with<T>(&self, work: impl FnOnce(Instant, &mut Engine) -> T) -> T {
+        let mut core = self.core.lock();
+        let before = core.engine.tick_at();
+        let result = work(Instant::now(), &mut core.engine);
+        let waits = self.flush(&mut core);
+        if waits != Waits::Nothing || core.engine.tick_at() < before {
+            self.wake.notify_one();
+        }
+        result
+    }
+
+    /// Only looks at it.
+    pub fn look<T>(&self, look: impl FnOnce(&Engine) -> T) -> T {
+        look(&self.core.lock().engine)
+    }
+
+    fn flush(&self, core: &mut Core) -> Waits {
+        let Core {
+            engine,
+            flow,
+            stalled,
+        } = core;
+        loop {
+            let next = stalled.take().or_else(|| {
+                engine.transmit(&mut |to, length| flow.room(Instant::now(), to, length))
+            });
+            let Some(datagram) = next else {
+                return if engine.is_waiting() {
+                    Waits::Receivers
+                } else {
+                    Waits::Nothing
+                };
+            };
+            match SockRef::from(&self.user).send_to_vectored(&datagram.parts(), &datagram.to.into())
+            {
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    *stalled = Some(datagram);
+                    return Waits::Socket;
+                }
+                // A network that is gone, or a receiver that is not there: as if it was lost on the way.
+                Err(error) => tracing::trace!(%error, to = %datagram.to, "a datagram was not sent"),
+            }
+        }
+    }
+
+    /// Takes what has come on a socket.
+    fn take(&self, socket: &UdpSocket, buffer: &mut Vec<u8>) {
+        let mut came = Vec::with_capacity(AT_ONCE);
+        while came.len() < AT_ONCE {
+            buffer.resize(LONGEST, 0);
+            let Ok(length) = socket.try_recv(buffer) else {
+                break;
+            };
+            came.push(if length <= COPIED {
+                Bytes::copy_from_slice(&buffer[..length])
+            } else {
+                buffer.truncate(length);
+                Bytes::from(std::mem::take(buffer))
+            });
+        }
+        if came.is_empty() {
+            return;
+        }
+        let deliveries = {
+            let mut core = self.core.lock();
+            let now = Instant::now();
+            for datagram in &came {
+                core.engine.receive(now, datagram);
+            }
+            if core.engine.tick_at() <= now {
+                core.engine.tick(now);
+            }
+            core.engine.take_deliveries()
+        };
+        for (sink, sample) in deliveries {
+            sink.sample(sample);
+        }
+    }
+
+    fn tick(&self) {
+        let deliveries = {
+            let mut core = self.core.lock();
+            core.engine.tick(Instant::now());
+            core.engine.take_deliveries()
+        };
+        for (sink, sample) in deliveries {
+            sink.sample(sample);
+        }
+    }
+
+    fn look_at_ports(&self) {
+        let mut core = self.core.lock();
+        let Core { engine, flow, .. } = &mut *core;
+        let now = Instant::now();
+        flow.tidy(now);
+        match flow.bound() {
+            Ok(bound) if !bound.is_empty() => engine.ports_bound(now, &bound),
+            Ok(_) => {}
+            Err(error) => tracing::debug!(%error, "the ports of a network namespace are not known"),
+        }
+    }
+}
+
+/// Drives a participant until it is aborted.
+pub(crate) async fn drive(shared: Arc<Shared>) {
+    let timer = match timer() {
+        Ok(timer) => timer,
+        Err(error) => {
+            tracing::error!(%error, "a DDS participant has no timer and will not be served");
+            return;
+        }
+    };
+    let mut buffer = Vec::new();
+    let mut ports = tokio::time::interval(PORTS);
+    ports.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let sees = shared.core.lock().flow.sees();
+    loop {
+        let (waits, tick_at) = {
+            let mut core = shared.core.lock();
+            let waits = shared.flush(&mut core);
+            (waits, core.engine.tick_at())
+        };
+        if waits == Waits::Receivers {
+            let nothing = Timespec {
+                tv_sec: 0,
+                tv_nsec: 0,
+            };
+            let once = Itimerspec {
+                it_interval: nothing,
+                it_value: LOOK_AGAIN,
+            };
+            if let Err(error) = timerfd_settime(timer.get_ref(), TimerfdTimerFlags::empty(), &once)
+            {
+                tracing::debug!(%error, "a timer was not set");
+            }
+        }
+        let multicast = async {
+            match &shared.multicast {
+                Some(socket) => socket.readable().await.map(|()| socket),
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            Ok(()) = shared.user.readable() => shared.take(&shared.user, &mut buffer),
+            Ok(()) = shared.discovery.readable() => shared.take(&shared.discovery, &mut buffer),
+            Ok(socket) = multicast => shared.take(socket, &mut buffer),
+            Ok(mut ready) = timer.readable(), if waits == Waits::Receivers => {
+                let mut expirations = [0; 8];
+                let _ = rustix::io::read(timer.get_ref(), &mut expirations);
+                ready.clear_ready();
+            }
+            Ok(()) = shared.user.writable(), if waits == Waits::Socket => {}
+            () = tokio::time::sleep_until(tick_at.into()) => shared.tick(),
+            () = shared.wake.notified() => {}
+            _ = ports.tick(), if sees => shared.look_at_ports(),
+        }
+    }
+}
+
+fn timer() -> io::Result<AsyncFd<OwnedFd>> {
+    let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
+    let timer = timerfd_create(TimerfdClockId::Monotonic, flags)?;
+    // SAFETY: the descriptor belongs to what is returned alone, which never gives it away: it is open as long as it is registered.
+    Ok(unsafe { AsyncFd::register(timer) }?)
+}

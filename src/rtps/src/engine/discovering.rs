@@ -1,0 +1,446 @@
+//! Who is there: participants announce themselves (8.5.3), and their ends to those that they know (8.5.4).
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use tokio::sync::watch;
+
+use super::{Datagram, Engine, LocalReader, LocalWriter, Remote};
+use crate::discovery::{self, EndpointData, ParticipantData};
+use crate::participant::Sample;
+use crate::reader::ReaderState;
+use crate::wire::{self, InlineQos};
+use crate::writer::{Change, Wanted, WriterState};
+use crate::{EntityId, Guid, GuidPrefix, SequenceNumber};
+
+/// The first pause between two announcements; each is twice as long as the one before.
+pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(20);
+/// Announcements never come more seldom: a third of the lease that is told.
+const LAST_PAUSE: Duration = Duration::from_secs(3);
+/// How often a newcomer's port is told of us: its socket may be there before whoever reads it.
+const TOLD_AGAIN: Duration = Duration::from_millis(50);
+/// More participants, and more ends of each, are not kept.
+const MOST_PARTICIPANTS: usize = 256;
+const MOST_ENDS: usize = 16_384;
+/// Ends that were taken back are told to newcomers, but not for ever.
+const MOST_WITHDRAWN: usize = 64;
+
+const DISPOSED: u32 = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
+
+/// The pairs of ends by which ends are announced: who writes, and who reads.
+const ANNOUNCERS: [(EntityId, EntityId); 2] = [
+    (EntityId::PUBLICATIONS_WRITER, EntityId::PUBLICATIONS_READER),
+    (
+        EntityId::SUBSCRIPTIONS_WRITER,
+        EntityId::SUBSCRIPTIONS_READER,
+    ),
+];
+
+/// Bits of `PID_BUILTIN_ENDPOINT_SET`: who announces ends, and who hears of them (9.3.2.12).
+const ANNOUNCES: [u32; 2] = [1 << 2, 1 << 4];
+const HEARS: [u32; 2] = [1 << 3, 1 << 5];
+/// What our participants have.
+pub(crate) const BUILTIN: u32 = 0x3f;
+
+impl Engine {
+    pub(super) fn add_builtin_ends(&mut self) {
+        for (writer, reader) in ANNOUNCERS {
+            let own = builtin(self.own.prefix, writer);
+            self.writers.insert(
+                writer,
+                LocalWriter {
+                    state: WriterState::new(own),
+                    ends: watch::Sender::new(Arc::default()),
+                    leaves: None,
+                },
+            );
+            let state = ReaderState::new(builtin(self.own.prefix, reader), self.bounds.clone());
+            self.readers.insert(
+                reader,
+                LocalReader {
+                    state,
+                    ends: watch::Sender::new(Arc::default()),
+                    sink: None,
+                },
+            );
+        }
+    }
+
+    // ---- announcing ourselves
+
+    /// Announces this participant where it is due, and lets those go of whom nothing was heard; when to come back.
+    pub(super) fn tick_discovery(&mut self, now: Instant) -> Instant {
+        if self.announce_at <= now && !self.closed {
+            self.announce();
+            self.announce_at = now + self.announce_pause;
+            self.announce_pause = (self.announce_pause * 2).min(LAST_PAUSE);
+        }
+        let gone = |remote: &Remote| {
+            remote
+                .data
+                .lease
+                .is_some_and(|lease| now.saturating_duration_since(remote.heard) > lease)
+        };
+        let silent: Vec<GuidPrefix> = self
+            .remotes
+            .iter()
+            .filter(|(_, remote)| gone(remote))
+            .map(|(prefix, _)| *prefix)
+            .collect();
+        for prefix in silent {
+            self.participant_gone(prefix);
+        }
+        self.announce_at.min(now + LAST_PAUSE)
+    }
+
+    /// Announces more often for a while: somebody may have come.
+    pub(super) fn announce_soon(&mut self, now: Instant) {
+        self.announce_pause = FIRST_PAUSE;
+        self.announce_at = self.announce_at.min(now + TOLD_AGAIN);
+        self.wake(self.announce_at);
+    }
+
+    fn announce(&mut self) {
+        let known = self
+            .remotes
+            .values()
+            .map(|remote| (remote.discovery, remote.data.prefix));
+        let unknown = self.announce_to.iter().map(|to| (*to, GuidPrefix::UNKNOWN));
+        let ports = self.bound.iter().map(|port| {
+            (
+                SocketAddr::from(([127, 0, 0, 1], *port)),
+                GuidPrefix::UNKNOWN,
+            )
+        });
+        let mut told = BTreeSet::new();
+        let all: Vec<_> = known
+            .chain(unknown)
+            .chain(ports)
+            .filter(|(to, _)| told.insert(*to))
+            .collect();
+        for (to, prefix) in all {
+            self.announce_to(to, prefix, 0);
+        }
+    }
+
+    fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix, status: u32) {
+        self.announcements += 1;
+        let key = (status != 0).then(|| self.guid().bytes());
+        let data = wire::Data {
+            reader: EntityId::SPDP_READER,
+            writer: EntityId::SPDP_WRITER,
+            number: SequenceNumber(self.announcements),
+            inline: InlineQos {
+                related: None,
+                status,
+                key_hash: key,
+            },
+            payload: Some(if status == 0 {
+                self.own.to_bytes()
+            } else {
+                discovery::key(self.guid())
+            }),
+            key_only: status != 0,
+        };
+        let mut writer = wire::DatagramWriter::new(self.own.prefix);
+        if prefix != GuidPrefix::UNKNOWN {
+            writer.destination(prefix);
+        }
+        writer.timestamp(std::time::SystemTime::now().into());
+        writer.data(&data);
+        self.control.push_back(Datagram::whole(to, writer));
+    }
+
+    pub(super) fn say_goodbye(&mut self) {
+        let known: Vec<_> = self
+            .remotes
+            .values()
+            .map(|remote| (remote.discovery, remote.data.prefix))
+            .collect();
+        for (to, prefix) in known {
+            self.announce_to(to, prefix, DISPOSED);
+        }
+    }
+
+    // ---- ports of this machine
+
+    /// Which ports for discovery are bound in the network namespace: newcomers are told of us at once, and whose port is gone is
+    /// dead.
+    pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<u16>) {
+        let first = self.ports.discovery(0).unwrap_or(u16::MAX);
+        let last = self.ports.discovery(119).unwrap_or(u16::MAX);
+        let own: BTreeSet<u16> = self
+            .own
+            .discovery
+            .iter()
+            .filter_map(|locator| u16::try_from(locator.port).ok())
+            .collect();
+        let there = |port: &u16| {
+            (first..=last).contains(port) && (port - first) % 2 == 0 && !own.contains(port)
+        };
+        let found: BTreeSet<u16> = bound.iter().copied().filter(there).collect();
+        let new: Vec<u16> = found.difference(&self.bound).copied().collect();
+        if !new.is_empty() {
+            for port in new {
+                self.announce_to(
+                    SocketAddr::from(([127, 0, 0, 1], port)),
+                    GuidPrefix::UNKNOWN,
+                    0,
+                );
+            }
+            self.announce_soon(now);
+        }
+        self.bound = found;
+        let dead: Vec<GuidPrefix> = self
+            .remotes
+            .iter()
+            .filter(|(_, remote)| {
+                remote.discovery.ip().is_loopback() && !bound.contains(&remote.discovery.port())
+            })
+            .map(|(prefix, _)| *prefix)
+            .collect();
+        for prefix in dead {
+            self.participant_gone(prefix);
+        }
+        self.tell();
+    }
+
+    // ---- others
+
+    pub(super) fn participant_heard(&mut self, now: Instant, from: GuidPrefix, data: &wire::Data) {
+        if data.inline.status != 0 {
+            if let Some(guid) = discovery::guid_of_key(data) {
+                self.participant_gone(guid.prefix);
+            } else {
+                self.participant_gone(from);
+            }
+            return;
+        }
+        let Some(payload) = &data.payload else {
+            return;
+        };
+        let told = match ParticipantData::from_payload(payload) {
+            Ok(told) => told,
+            Err(error) => {
+                tracing::debug!(%error, "an announcement of a DDS participant was not understood");
+                return;
+            }
+        };
+        let elsewhere = told.domain.is_some() && told.domain != self.own.domain;
+        if told.prefix == self.own.prefix || told.prefix != from || elsewhere {
+            return;
+        }
+        if let Some(remote) = self.remotes.get_mut(&from) {
+            remote.heard = now;
+            if *remote.data == told {
+                return;
+            }
+            // Where it is may have changed, and what it has: it is met anew.
+            if remote.data.discovery != told.discovery
+                || remote.data.user != told.user
+                || remote.data.builtin != told.builtin
+            {
+                self.participant_gone(from);
+            } else {
+                remote.data = Arc::new(told);
+                self.discovered
+                    .participants
+                    .insert(from, Arc::clone(&remote.data));
+                self.discovered_changed = true;
+                return;
+            }
+        }
+        self.participant_came(now, told);
+    }
+
+    fn participant_came(&mut self, now: Instant, told: ParticipantData) {
+        let Some(discovery) = discovery::reachable(&told.discovery) else {
+            return;
+        };
+        // An address belongs to one process at a time: whoever had it before is gone.
+        let before: Vec<GuidPrefix> = self
+            .remotes
+            .iter()
+            .filter(|(_, remote)| remote.discovery == discovery)
+            .map(|(prefix, _)| *prefix)
+            .collect();
+        for prefix in before {
+            self.participant_gone(prefix);
+        }
+        if self.remotes.len() >= MOST_PARTICIPANTS {
+            tracing::warn!(
+                "more than {MOST_PARTICIPANTS} DDS participants; {:?} is not heard",
+                told.prefix
+            );
+            return;
+        }
+        let user = discovery::reachable(&told.user).unwrap_or(discovery);
+        let (prefix, vendor, has) = (told.prefix, told.vendor, told.builtin);
+        let data = Arc::new(told);
+        self.discovered
+            .participants
+            .insert(prefix, Arc::clone(&data));
+        self.discovered_changed = true;
+        self.remotes.insert(
+            prefix,
+            Remote {
+                data,
+                discovery,
+                user,
+                heard: now,
+            },
+        );
+        self.announce_to(discovery, prefix, 0);
+        for (index, (writer, reader)) in ANNOUNCERS.into_iter().enumerate() {
+            if has & HEARS[index] != 0 {
+                let mut wanted = Wanted::default();
+                if let Some(ours) = self.writers.get_mut(&writer) {
+                    ours.state.matched(
+                        now,
+                        Arc::new(builtin(prefix, reader)),
+                        discovery,
+                        &mut wanted,
+                    );
+                }
+                self.enqueue(writer, wanted);
+            }
+            if has & ANNOUNCES[index] != 0 {
+                if let Some(ours) = self.readers.get_mut(&reader) {
+                    ours.state
+                        .matched(now, Arc::new(builtin(prefix, writer)), discovery, vendor);
+                }
+            }
+        }
+        self.announce_soon(now);
+        self.wake(now);
+    }
+
+    /// A participant has gone, and with it all its ends.
+    pub fn participant_gone(&mut self, prefix: GuidPrefix) {
+        let Some(remote) = self.remotes.remove(&prefix) else {
+            return;
+        };
+        self.discovered.participants.remove(&prefix);
+        self.discovered_changed = true;
+        for (writer, reader) in ANNOUNCERS {
+            if let Some(ours) = self.writers.get_mut(&writer) {
+                ours.state.unmatched(Guid::new(prefix, reader));
+            }
+            if let Some(ours) = self.readers.get_mut(&reader) {
+                ours.state.unmatched(Guid::new(prefix, writer));
+            }
+        }
+        let ends = self
+            .discovered
+            .writers
+            .keys()
+            .chain(self.discovered.readers.keys());
+        let ends: Vec<Guid> = ends.filter(|guid| guid.prefix == prefix).copied().collect();
+        for guid in ends {
+            self.end_gone(guid);
+        }
+        let still = |address: SocketAddr| {
+            self.remotes
+                .values()
+                .any(|other| other.discovery == address || other.user == address)
+        };
+        let unused: Vec<SocketAddr> = [remote.discovery, remote.user]
+            .into_iter()
+            .filter(|address| !still(*address))
+            .collect();
+        for address in unused {
+            self.paths.remove(&address);
+        }
+    }
+
+    /// Something came from one of the protocol's own writers: an end, or that one is gone.
+    pub(super) fn end_heard(&mut self, reader: EntityId, sample: &Sample) {
+        if let Some(gone) = sample.withdrawn {
+            self.end_gone(gone);
+            return;
+        }
+        let told = match EndpointData::from_payload(&sample.payload) {
+            Ok(told) => told,
+            Err(error) => {
+                tracing::debug!(%error, "an announcement of a DDS topic's end was not understood");
+                return;
+            }
+        };
+        let fits = told.guid.prefix == sample.writer.prefix
+            && told.guid.entity.is_writer() == (reader == EntityId::PUBLICATIONS_READER)
+            && !told.guid.entity.is_builtin();
+        if !fits {
+            return;
+        }
+        let ends = self.discovered.writers.len() + self.discovered.readers.len();
+        if ends >= MOST_ENDS {
+            tracing::warn!(
+                "more than {MOST_ENDS} DDS writers and readers; that of topic {} is not heard",
+                told.topic
+            );
+            return;
+        }
+        self.end_came(Instant::now(), Arc::new(told));
+    }
+
+    // ---- our ends
+
+    pub(super) fn announce_end(&mut self, now: Instant, own: &EndpointData) {
+        let announcer = announcer(own.guid.entity);
+        let number = self.publish(
+            now,
+            announcer,
+            Engine::change_of_announcement(own.to_bytes()),
+        );
+        self.announced.insert(own.guid.entity, number);
+        self.wake(now);
+    }
+
+    pub(super) fn withdraw_end(&mut self, now: Instant, entity: EntityId) {
+        let Some(number) = self.announced.remove(&entity) else {
+            return;
+        };
+        let announcer = announcer(entity);
+        let guid = Guid::new(self.own.prefix, entity);
+        let change = Change {
+            status: DISPOSED,
+            key: Some(guid.bytes()),
+            ..Engine::change_of_announcement(discovery::key(guid))
+        };
+        let withdrawal = self.publish(now, announcer, change);
+        self.withdrawn.push_back((announcer, withdrawal));
+        let old = (self.withdrawn.len() > MOST_WITHDRAWN)
+            .then(|| self.withdrawn.pop_front())
+            .flatten();
+        for (announcer, number) in [Some((announcer, number)), old].into_iter().flatten() {
+            if let Some(writer) = self.writers.get_mut(&announcer) {
+                writer.state.forget(number);
+            }
+        }
+        self.wake(now);
+    }
+}
+
+fn announcer(entity: EntityId) -> EntityId {
+    if entity.is_writer() {
+        EntityId::PUBLICATIONS_WRITER
+    } else {
+        EntityId::SUBSCRIPTIONS_WRITER
+    }
+}
+
+/// One of the protocol's own ends.
+fn builtin(prefix: GuidPrefix, entity: EntityId) -> EndpointData {
+    EndpointData {
+        guid: Guid::new(prefix, entity),
+        topic: String::new(),
+        type_name: String::new(),
+        qos: Engine::builtin_qos(),
+        user_data: Bytes::new(),
+        unicast: Vec::new(),
+        expects_inline_qos: false,
+    }
+}

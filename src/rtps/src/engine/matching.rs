@@ -1,0 +1,227 @@
+//! Which of our ends pass samples with which of others: those of one topic and one type whose quality of service fits (8.4.15).
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::Engine;
+use crate::discovery::{self, EndpointData};
+use crate::participant::Ends;
+use crate::qos::Mismatch;
+use crate::writer::Wanted;
+use crate::{EntityId, Guid};
+
+impl Engine {
+    /// Another participant's end is there, or has changed.
+    pub(super) fn end_came(&mut self, now: Instant, told: Arc<EndpointData>) {
+        let guid = told.guid;
+        let known = if guid.entity.is_writer() {
+            &mut self.discovered.writers
+        } else {
+            &mut self.discovered.readers
+        };
+        if known.get(&guid).is_some_and(|before| *before == told) {
+            return;
+        }
+        let again = known.insert(guid, Arc::clone(&told)).is_some();
+        self.discovered_changed = true;
+        if again {
+            self.unmatch(guid);
+        }
+        if guid.entity.is_writer() {
+            let ours: Vec<EntityId> = self
+                .readers
+                .iter()
+                .filter(|(_, reader)| same(&reader.state.own, &told))
+                .map(|(entity, _)| *entity)
+                .collect();
+            for entity in ours {
+                self.match_reader(now, entity, &told);
+            }
+        } else {
+            let ours: Vec<EntityId> = self
+                .writers
+                .iter()
+                .filter(|(_, writer)| same(&writer.state.own, &told))
+                .map(|(entity, _)| *entity)
+                .collect();
+            for entity in ours {
+                self.match_writer(now, entity, &told);
+            }
+        }
+    }
+
+    pub(super) fn end_gone(&mut self, guid: Guid) {
+        let known = if guid.entity.is_writer() {
+            &mut self.discovered.writers
+        } else {
+            &mut self.discovered.readers
+        };
+        if known.remove(&guid).is_some() {
+            self.discovered_changed = true;
+            self.unmatch(guid);
+        }
+    }
+
+    fn unmatch(&mut self, guid: Guid) {
+        let Engine {
+            readers,
+            writers,
+            changed_ends,
+            ..
+        } = self;
+        for (entity, reader) in readers {
+            let refused = reader
+                .ends
+                .borrow()
+                .refused
+                .iter()
+                .any(|(end, _)| end.guid == guid);
+            if reader.state.unmatched(guid) || refused {
+                changed_ends.insert(*entity);
+            }
+        }
+        for (entity, writer) in writers {
+            let refused = writer
+                .ends
+                .borrow()
+                .refused
+                .iter()
+                .any(|(end, _)| end.guid == guid);
+            if writer.state.unmatched(guid) || refused {
+                changed_ends.insert(*entity);
+            }
+        }
+    }
+
+    pub(super) fn match_own_writer(&mut self, now: Instant, entity: EntityId) {
+        let Some(own) = self
+            .writers
+            .get(&entity)
+            .map(|writer| writer.state.own.clone())
+        else {
+            return;
+        };
+        let theirs: Vec<_> = self
+            .discovered
+            .readers
+            .values()
+            .filter(|end| same(&own, end))
+            .cloned()
+            .collect();
+        for end in theirs {
+            self.match_writer(now, entity, &end);
+        }
+    }
+
+    pub(super) fn match_own_reader(&mut self, now: Instant, entity: EntityId) {
+        let Some(own) = self
+            .readers
+            .get(&entity)
+            .map(|reader| reader.state.own.clone())
+        else {
+            return;
+        };
+        let theirs: Vec<_> = self
+            .discovered
+            .writers
+            .values()
+            .filter(|end| same(&own, end))
+            .cloned()
+            .collect();
+        for end in theirs {
+            self.match_reader(now, entity, &end);
+        }
+    }
+
+    /// A writer of ours meets a reader.
+    fn match_writer(&mut self, now: Instant, entity: EntityId, reader: &Arc<EndpointData>) {
+        let Some(address) = self.address(reader) else {
+            return;
+        };
+        self.changed_ends.insert(entity);
+        let mut wanted = Wanted::default();
+        if let Some(ours) = self.writers.get_mut(&entity) {
+            if ours.state.own.qos.mismatches(&reader.qos).is_empty() {
+                ours.state
+                    .matched(now, Arc::clone(reader), address, &mut wanted);
+            }
+        }
+        self.enqueue(entity, wanted);
+        self.wake(now);
+    }
+
+    /// A reader of ours meets a writer.
+    fn match_reader(&mut self, now: Instant, entity: EntityId, writer: &Arc<EndpointData>) {
+        let Some(address) = self.address(writer) else {
+            return;
+        };
+        let vendor = self.vendor_of(writer.guid.prefix);
+        self.changed_ends.insert(entity);
+        if let Some(ours) = self.readers.get_mut(&entity) {
+            if writer.qos.mismatches(&ours.state.own.qos).is_empty() {
+                ours.state.matched(now, Arc::clone(writer), address, vendor);
+            }
+        }
+        self.wake(now);
+    }
+
+    /// Where an end of another participant receives.
+    fn address(&self, end: &EndpointData) -> Option<SocketAddr> {
+        let remote = self.remotes.get(&end.guid.prefix)?;
+        Some(discovery::reachable(&end.unicast).unwrap_or(remote.user))
+    }
+
+    /// Tells whoever waits what has changed since the last time.
+    pub(super) fn tell(&mut self) {
+        for entity in std::mem::take(&mut self.changed_ends) {
+            if let Some(writer) = self.writers.get(&entity) {
+                let refused = |end: &Arc<EndpointData>| writer.state.own.qos.mismatches(&end.qos);
+                let theirs = self
+                    .discovered
+                    .readers
+                    .values()
+                    .filter(|end| same(&writer.state.own, end));
+                writer
+                    .ends
+                    .send_replace(Arc::new(ends(writer.state.readers(), theirs, refused)));
+            } else if let Some(reader) = self.readers.get(&entity) {
+                let refused = |end: &Arc<EndpointData>| end.qos.mismatches(&reader.state.own.qos);
+                let theirs = self
+                    .discovered
+                    .writers
+                    .values()
+                    .filter(|end| same(&reader.state.own, end));
+                reader
+                    .ends
+                    .send_replace(Arc::new(ends(reader.state.writers(), theirs, refused)));
+            }
+        }
+        if std::mem::take(&mut self.discovered_changed) {
+            self.discovered.generation += 1;
+            self.told.send_replace(Arc::new(self.discovered.clone()));
+        }
+    }
+}
+
+fn ends<'a>(
+    matched: impl Iterator<Item = (&'a Arc<EndpointData>, bool)>,
+    theirs: impl Iterator<Item = &'a Arc<EndpointData>>,
+    mismatches: impl Fn(&Arc<EndpointData>) -> Vec<Mismatch>,
+) -> Ends {
+    let mut ends = Ends::default();
+    for (end, confirmed) in matched {
+        ends.matched.push(Arc::clone(end));
+        ends.confirmed.extend(confirmed.then_some(end.guid));
+    }
+    let refused = theirs
+        .map(|end| (Arc::clone(end), mismatches(end)))
+        .filter(|(_, why)| !why.is_empty());
+    ends.refused = refused.collect();
+    ends
+}
+
+/// Whether two ends speak of the same.
+fn same(ours: &EndpointData, theirs: &EndpointData) -> bool {
+    ours.topic == theirs.topic && ours.type_name == theirs.type_name
+}

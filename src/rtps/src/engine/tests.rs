@@ -1,0 +1,538 @@
+//! Participants on a network made of queues: it loses what it is told to lose, and time passes when nothing else happens.
+
+use parking_lot::Mutex;
+
+use super::*;
+use crate::locator::Locator;
+use crate::qos::Reliability;
+use crate::reader::Bounds;
+
+/// What a reader has read.
+#[derive(Default)]
+struct Read(Mutex<Vec<Sample>>);
+
+impl Sink for Read {
+    fn sample(&self, sample: Sample) {
+        self.0.lock().push(sample);
+    }
+}
+
+impl Read {
+    fn lengths(&self) -> Vec<usize> {
+        self.0
+            .lock()
+            .iter()
+            .map(|sample| sample.payload.len())
+            .collect()
+    }
+
+    /// The first byte behind the header of each.
+    fn marks(&self) -> Vec<u8> {
+        self.0
+            .lock()
+            .iter()
+            .map(|sample| sample.payload[4])
+            .collect()
+    }
+}
+
+struct World {
+    now: Instant,
+    engines: Vec<Engine>,
+    /// Which of all datagrams are lost, by their number.
+    loses: Box<dyn FnMut(usize, &[u8]) -> bool>,
+    sent: usize,
+    /// What receivers take at a time, in bytes; all if none.
+    room: Option<usize>,
+}
+
+fn discovery_of(index: usize) -> u16 {
+    7410 + 2 * index as u16
+}
+
+impl World {
+    fn of(participants: usize) -> Self {
+        let mut world = Self {
+            now: Instant::now(),
+            engines: Vec::new(),
+            loses: Box::new(|_, _| false),
+            sent: 0,
+            room: None,
+        };
+        (0..participants).for_each(|_| world.join());
+        world
+    }
+
+    fn join(&mut self) {
+        let index = self.engines.len();
+        let at = |port: u16| vec![Locator::from((std::net::Ipv4Addr::LOCALHOST, port))];
+        let own = ParticipantData {
+            prefix: GuidPrefix([index as u8 + 1; 12]),
+            vendor: VendorId::OURS,
+            version: [2, 3],
+            domain: Some(0),
+            name: format!("participant {index}"),
+            user_data: Bytes::new(),
+            discovery: at(discovery_of(index)),
+            user: at(discovery_of(index) + 1),
+            builtin: BUILTIN,
+            lease: Some(Duration::from_secs(10)),
+        };
+        let bounds = Bounds {
+            max_sample: 16 << 20,
+            budget: budget::Budget::unlimited(),
+            unfinished: Duration::from_secs(30),
+        };
+        let announce_to = (0..4)
+            .map(|other| SocketAddr::from(([127, 0, 0, 1], discovery_of(other))))
+            .collect();
+        let ports = Ports::of(0).expect("a domain");
+        self.engines.push(Engine::new(
+            self.now,
+            Settings {
+                own,
+                ports,
+                bounds,
+                announce_to,
+            },
+        ));
+    }
+
+    /// Carries what there is to carry, once; whether there was anything.
+    fn carry(&mut self) -> bool {
+        let mut carried = false;
+        for index in 0..self.engines.len() {
+            let mut left = self.room.unwrap_or(usize::MAX);
+            let mut out = Vec::new();
+            while let Some(datagram) = self.engines[index].transmit(&mut |_, length| {
+                let fits = left >= length;
+                left -= if fits { length } else { 0 };
+                fits
+            }) {
+                out.push(datagram);
+            }
+            for datagram in out {
+                carried = true;
+                let bytes: Bytes = datagram
+                    .parts()
+                    .iter()
+                    .flat_map(|part| part.to_vec())
+                    .collect();
+                self.sent += 1;
+                if (self.loses)(self.sent, &bytes) {
+                    continue;
+                }
+                let to = usize::from((datagram.to.port() - 7410) / 2);
+                if let Some(engine) = self.engines.get_mut(to) {
+                    engine.receive(self.now, &bytes);
+                }
+            }
+        }
+        for engine in &mut self.engines {
+            for (sink, sample) in engine.take_deliveries() {
+                sink.sample(sample);
+            }
+        }
+        carried
+    }
+
+    /// Lets the world go on for so long.
+    fn pass(&mut self, duration: Duration) {
+        let until = self.now + duration;
+        for _ in 0..200_000 {
+            if self.carry() {
+                continue;
+            }
+            let next = self
+                .engines
+                .iter()
+                .map(Engine::tick_at)
+                .min()
+                .unwrap_or(until);
+            if next > until {
+                break;
+            }
+            self.now = self.now.max(next);
+            for engine in &mut self.engines {
+                if engine.tick_at() <= self.now {
+                    engine.tick(self.now);
+                }
+            }
+        }
+        self.now = until;
+    }
+
+    fn writer(&mut self, engine: usize, qos: EndpointQos) -> (Guid, watch::Receiver<Arc<Ends>>) {
+        let now = self.now;
+        self.engines[engine].add_writer(now, &topic(), qos)
+    }
+
+    fn reader(
+        &mut self,
+        engine: usize,
+        qos: EndpointQos,
+    ) -> (Guid, watch::Receiver<Arc<Ends>>, Arc<Read>) {
+        let now = self.now;
+        let read = Arc::new(Read::default());
+        let (guid, ends) = self.engines[engine].add_reader(now, &topic(), qos, read.clone());
+        (guid, ends, read)
+    }
+
+    fn write(&mut self, writer: Guid, mark: u8, length: usize) {
+        let now = self.now;
+        let mut payload = vec![mark; length];
+        payload[..4].copy_from_slice(&[0, 1, 0, 0]);
+        let index = usize::from(writer.prefix.0[0]) - 1;
+        self.engines[index].write(now, writer.entity, payload.into(), None);
+    }
+}
+
+fn topic() -> Topic {
+    Topic {
+        name: "rt/chatter".into(),
+        type_name: "std_msgs::msg::dds_::String_".into(),
+        user_data: Bytes::new(),
+    }
+}
+
+fn keep(depth: u32) -> EndpointQos {
+    EndpointQos {
+        history: History::KeepLast(depth),
+        ..EndpointQos::default()
+    }
+}
+
+fn best_effort() -> EndpointQos {
+    EndpointQos {
+        reliability: Reliability::BestEffort,
+        ..keep(10)
+    }
+}
+
+fn transient(depth: u32) -> EndpointQos {
+    EndpointQos {
+        durability: Durability::TransientLocal,
+        ..keep(depth)
+    }
+}
+
+const SECOND: Duration = Duration::from_secs(1);
+
+/// Numbers that look random and are the same every time.
+fn scattered(seed: u64) -> impl FnMut() -> u64 {
+    let mut state = seed;
+    move || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        state >> 33
+    }
+}
+
+#[test]
+fn participants_find_each_other_and_samples_arrive_in_order() {
+    let mut world = World::of(2);
+    let (writer, writer_ends) = world.writer(0, keep(10));
+    let (reader, reader_ends, read) = world.reader(1, keep(10));
+    world.pass(SECOND / 5);
+    assert_eq!(writer_ends.borrow().confirmed, [reader]);
+    assert_eq!(reader_ends.borrow().confirmed, [writer]);
+    for (mark, length) in [
+        (1, 8),
+        (2, 100_000),
+        (3, 8),
+        (4, 15_872),
+        (5, 15_873),
+        (6, 3_000_001),
+    ] {
+        world.write(writer, mark, length);
+    }
+    world.pass(SECOND / 10);
+    assert_eq!(read.marks(), [1, 2, 3, 4, 5, 6]);
+    assert_eq!(read.lengths(), [8, 100_000, 8, 15_872, 15_873, 3_000_001]);
+    let discovered = world.engines[0].discovered().borrow().clone();
+    assert_eq!(discovered.participants.len(), 1);
+    assert_eq!(
+        discovered.readers.keys().copied().collect::<Vec<_>>(),
+        [reader]
+    );
+}
+
+#[test]
+fn whatever_the_network_loses_reliable_samples_come_once_and_in_order() {
+    for seed in 0..20 {
+        let mut world = World::of(2);
+        let mut random = scattered(seed);
+        world.loses = Box::new(move |_, _| random() % 4 == 0);
+        let (writer, _) = world.writer(0, keep(100));
+        let (_, _, read) = world.reader(1, keep(100));
+        world.pass(SECOND * 5);
+        let mut random = scattered(seed + 1000);
+        for mark in 0..50 {
+            world.write(writer, mark, 8 + (random() % 60_000) as usize);
+            world.pass(Duration::from_millis(random() % 30));
+        }
+        world.pass(SECOND * 20);
+        assert_eq!(read.marks(), (0..50).collect::<Vec<u8>>(), "seed {seed}");
+    }
+}
+
+#[test]
+fn best_effort_samples_are_whole_or_lost_and_never_out_of_order() {
+    for seed in 0..10 {
+        let mut world = World::of(2);
+        let (writer, _) = world.writer(0, best_effort());
+        let (_, _, read) = world.reader(1, best_effort());
+        world.pass(SECOND);
+        let mut random = scattered(seed);
+        world.loses = Box::new(move |_, _| random() % 20 == 0);
+        for mark in 0..100 {
+            world.write(writer, mark, 8 + usize::from(mark % 3) * 40_000);
+            world.pass(Duration::from_millis(10));
+        }
+        let marks = read.marks();
+        assert!(
+            marks.is_sorted_by(|before, after| before < after),
+            "seed {seed}: {marks:?}"
+        );
+        assert!(
+            (50..100).contains(&marks.len()),
+            "seed {seed}: {} of 100",
+            marks.len()
+        );
+        for (mark, length) in marks.iter().zip(read.lengths()) {
+            assert_eq!(length, 8 + usize::from(mark % 3) * 40_000);
+        }
+    }
+}
+
+#[test]
+fn newcomers_are_given_what_is_kept_for_them_and_nothing_else() {
+    let mut world = World::of(2);
+    let (kept, _) = world.writer(0, transient(2));
+    (1..=5).for_each(|mark| world.write(kept, mark, 8));
+    world.pass(SECOND);
+    let (_, _, wants_past) = world.reader(1, transient(10));
+    let (_, _, wants_none) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    assert_eq!(wants_past.marks(), [4, 5]);
+    assert_eq!(wants_none.marks(), []);
+    world.write(kept, 6, 8);
+    world.pass(SECOND);
+    assert_eq!(wants_past.marks(), [4, 5, 6]);
+    assert_eq!(wants_none.marks(), [6]);
+}
+
+#[test]
+fn ends_that_do_not_fit_are_told_why_and_others_are_not_disturbed() {
+    let mut world = World::of(2);
+    let (writer, writer_ends) = world.writer(0, best_effort());
+    let (reader, reader_ends, refused) = world.reader(1, keep(10));
+    let (other, _, taken) = world.reader(1, best_effort());
+    world.pass(SECOND);
+    world.write(writer, 1, 8);
+    world.pass(SECOND);
+    assert_eq!((refused.marks(), taken.marks()), (vec![], vec![1]));
+    let ends = writer_ends.borrow().clone();
+    assert_eq!(
+        ends.matched.iter().map(|end| end.guid).collect::<Vec<_>>(),
+        [other]
+    );
+    assert_eq!(ends.refused.len(), 1);
+    assert_eq!(ends.refused[0].0.guid, reader);
+    assert_eq!(reader_ends.borrow().refused[0].1[0].policy, "reliability");
+}
+
+#[test]
+fn who_falls_silent_is_gone_when_the_lease_is_over() {
+    let mut world = World::of(2);
+    let (_, ends) = world.writer(0, keep(10));
+    world.reader(1, keep(10));
+    world.pass(SECOND);
+    assert_eq!(ends.borrow().matched.len(), 1);
+    world.loses = Box::new(|_, bytes| bytes[8] == 2);
+    world.pass(SECOND * 8);
+    assert_eq!(ends.borrow().matched.len(), 1);
+    world.pass(SECOND * 8);
+    assert_eq!(ends.borrow().matched.len(), 0);
+    assert!(
+        world.engines[0]
+            .discovered()
+            .borrow()
+            .participants
+            .is_empty()
+    );
+}
+
+#[test]
+fn whose_port_is_gone_is_dead_at_once() {
+    let mut world = World::of(2);
+    let (_, ends) = world.writer(0, keep(10));
+    world.reader(1, keep(10));
+    world.pass(SECOND);
+    let now = world.now;
+    world.engines[0].ports_bound(now, &BTreeSet::from([7410, 7411, 7412, 7413]));
+    assert_eq!(ends.borrow().matched.len(), 1);
+    world.engines[0].ports_bound(now, &BTreeSet::from([7410, 7411]));
+    assert_eq!(ends.borrow().matched.len(), 0);
+}
+
+#[test]
+fn ends_that_are_taken_back_are_gone_there_too() {
+    let mut world = World::of(2);
+    let (_, ends) = world.writer(0, keep(10));
+    let (reader, _, _) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    assert_eq!(ends.borrow().matched.len(), 1);
+    let now = world.now;
+    drop(world.engines[1].remove_end(now, reader.entity));
+    world.pass(SECOND);
+    assert_eq!(ends.borrow().matched.len(), 0);
+    world.engines[1].close();
+    world.pass(SECOND / 10);
+    assert!(
+        world.engines[0]
+            .discovered()
+            .borrow()
+            .participants
+            .is_empty()
+    );
+}
+
+#[test]
+fn what_was_written_is_sent_though_the_writer_is_dropped() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(10));
+    let (_, ends, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    let mut random = scattered(3);
+    world.loses = Box::new(move |_, _| random() % 3 == 0);
+    (0..5).for_each(|mark| world.write(writer, mark, 30_000));
+    let now = world.now;
+    drop(world.engines[0].remove_end(now, writer.entity));
+    world.pass(SECOND * 4);
+    assert_eq!(read.marks(), [0, 1, 2, 3, 4]);
+    assert_eq!(ends.borrow().matched.len(), 0);
+}
+
+#[test]
+fn a_slow_receiver_gets_whole_samples_though_newer_ones_replace_them() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(
+        0,
+        EndpointQos {
+            history: History::KeepLast(1),
+            ..best_effort()
+        },
+    );
+    let (_, _, read) = world.reader(1, best_effort());
+    world.pass(SECOND);
+    // Two fragments pass between two samples of seven.
+    world.room = Some(33_000);
+    for mark in 0..40 {
+        world.write(writer, mark, 100_000);
+        world.carry();
+    }
+    world.room = None;
+    world.pass(SECOND);
+    let marks = read.marks();
+    assert!(marks.len() >= 8, "{marks:?}");
+    assert_eq!(marks.last(), Some(&39));
+    assert!(marks.is_sorted_by(|before, after| before < after));
+}
+
+#[test]
+fn a_reader_that_never_acknowledges_costs_no_more_than_the_depth() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(4));
+    let (_, _, read) = world.reader(1, keep(4));
+    world.pass(SECOND);
+    world.loses = Box::new(|_, _| true);
+    for mark in 0..10 {
+        world.write(writer, mark, 8);
+    }
+    world.carry();
+    assert_eq!(world.engines[0].dropped(writer.entity), 6);
+    world.loses = Box::new(|_, _| false);
+    world.pass(SECOND);
+    assert_eq!(read.marks(), [6, 7, 8, 9]);
+}
+
+#[test]
+fn requests_and_replies_keep_their_identity() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(10));
+    let (_, _, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    let related = SampleIdentity {
+        writer,
+        number: SequenceNumber(7),
+    };
+    let now = world.now;
+    for length in [8, 50_000] {
+        world.engines[0].write(now, writer.entity, vec![0; length].into(), Some(related));
+    }
+    world.pass(SECOND);
+    let told: Vec<_> = read.0.lock().iter().map(|sample| sample.related).collect();
+    assert_eq!(told, [Some(related), Some(related)]);
+}
+
+#[test]
+fn datagrams_of_nonsense_change_nothing() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(10));
+    let (_, ends, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    let mut kept: Vec<Bytes> = Vec::new();
+    for mark in 0..4 {
+        world.write(writer, mark, 40_000);
+        while let Some(datagram) = world.engines[0].transmit(&mut |_, _| true) {
+            kept.push(
+                datagram
+                    .parts()
+                    .iter()
+                    .flat_map(|part| part.to_vec())
+                    .collect(),
+            );
+        }
+    }
+    let mut random = scattered(7);
+    let now = world.now;
+    for _ in 0..20_000 {
+        let mut bytes = kept[random() as usize % kept.len()].to_vec();
+        // Never the sender: who says to be somebody else is believed, as there is no security.
+        for _ in 0..1 + random() % 8 {
+            let at = 20 + random() as usize % (bytes.len().min(200) - 20);
+            bytes[at] = random() as u8;
+        }
+        bytes.truncate(20 + random() as usize % bytes.len());
+        world.engines[1].receive(now, &bytes.into());
+        world.engines[1].take_deliveries();
+    }
+    assert_eq!(ends.borrow().matched.len(), 1);
+    drop(read);
+}
+
+#[test]
+fn a_hundred_topics_are_known_soon() {
+    let mut world = World::of(2);
+    let mut sinks = Vec::new();
+    for number in 0..100 {
+        let topic = Topic {
+            name: format!("rt/topic{number}"),
+            ..topic()
+        };
+        let now = world.now;
+        let read = Arc::new(Read::default());
+        world.engines[0].add_writer(now, &topic, keep(10));
+        world.engines[1].add_reader(now, &topic, keep(10), read.clone());
+        sinks.push(read);
+    }
+    world.pass(SECOND / 4);
+    let ours = world.engines[0]
+        .writers
+        .iter()
+        .filter(|(entity, _)| !entity.is_builtin());
+    let confirmed = ours.filter(|(_, writer)| writer.ends.borrow().confirmed.len() == 1);
+    assert_eq!(confirmed.count(), 100);
+}
