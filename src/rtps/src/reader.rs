@@ -498,7 +498,7 @@ impl WriterProxy {
             self.pause = (self.pause * 2).min(SELDOM_ASK);
             let set =
                 SequenceSet::empty(SequenceNumber(i64::from(self.vendor != VendorId::FAST_DDS)));
-            return self.to_writer(reader, set, false, Vec::new());
+            return self.told(reader, set, false, Vec::new());
         }
         let mut set = SequenceSet::empty(self.next);
         let until = self
@@ -532,10 +532,10 @@ impl WriterProxy {
             self.pause = (self.pause * 2).min(SELDOM_ASK);
         }
         let is_final = set.is_empty();
-        self.to_writer(reader, set, is_final, nack_frags)
+        self.told(reader, set, is_final, nack_frags)
     }
 
-    fn to_writer(
+    fn told(
         &mut self,
         reader: EntityId,
         set: SequenceSet,

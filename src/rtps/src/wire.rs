@@ -3,6 +3,8 @@
 //! A datagram is a header and submessages. Those that only tell about the ones after them (who sends, to whom, when) are
 //! carried out here: what is given on is a [`Received`] for each of the others. Payloads are slices of the datagram.
 
+#[cfg(test)]
+mod captured;
 mod input;
 mod kind;
 mod liveliness;
@@ -20,7 +22,7 @@ pub(crate) use input::Input;
 pub use liveliness::ParticipantMessage;
 pub(crate) use parameters::{ParameterWriter, list, list_header, parameter, pid};
 pub use read::parse;
-pub use write::{DataFragHead, DataHead, DatagramWriter};
+pub use write::{DataFragHead, DatagramWriter};
 
 use crate::time::WireTime;
 use crate::{

@@ -3,7 +3,9 @@
 use parking_lot::Mutex;
 
 use super::*;
+use crate::SampleIdentity;
 use crate::locator::Locator;
+use crate::participant::Topic;
 use crate::qos::Reliability;
 use crate::reader::Bounds;
 
@@ -36,11 +38,14 @@ impl Read {
     }
 }
 
+/// Says of a datagram, by its number and bytes, whether it is lost.
+type Loses = Box<dyn FnMut(usize, &[u8]) -> bool>;
+
 struct World {
     now: Instant,
     engines: Vec<Engine>,
     /// Which of all datagrams are lost, by their number.
-    loses: Box<dyn FnMut(usize, &[u8]) -> bool>,
+    loses: Loses,
     sent: usize,
     /// What receivers take at a time, in bytes; all if none.
     room: Option<usize>,

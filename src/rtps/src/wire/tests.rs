@@ -246,9 +246,7 @@ fn a_length_of_zero_is_the_rest_of_the_datagram_but_for_padding_and_no_time() {
 
 #[test]
 fn what_is_unknown_is_passed_over() {
-    let parsed = said(&format!(
-        "8001 0600 010203040506 0000 0f01 0400 00000000 3101 0000"
-    ));
+    let parsed = said("8001 0600 010203040506 0000 0f01 0400 00000000 3101 0000");
     assert_eq!(parsed, Parsed::default());
     let parsed = said(&format!("8001 0600 010203040506 0000 {HEARTBEAT}"));
     assert_eq!((parsed.received.len(), parsed.fault), (1, None));

@@ -15,19 +15,6 @@ const LITTLE: u8 = 1;
 
 static ZEROS: [u8; 3] = [0; 3];
 
-/// DATA without its payload, which is sent behind it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct DataHead {
-    /// For which reader; UNKNOWN: all that match.
-    pub reader: EntityId,
-    /// Of which writer.
-    pub writer: EntityId,
-    /// Its number.
-    pub number: SequenceNumber,
-    /// What it tells of itself.
-    pub inline: InlineQos,
-}
-
 /// DATA_FRAG without its payload, which is sent behind it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DataFragHead {
@@ -177,24 +164,9 @@ impl DatagramWriter {
         })
     }
 
-    /// The last submessage of the datagram, a sample, up to its payload. The payload is to be sent right behind the datagram,
-    /// and behind that what is returned: at most three zeros, which the submessage's length counts. Fast DDS sends them too,
-    /// and Cyclone DDS refuses a last fragment of less than four bytes.
-    #[must_use = "the zeros are part of the datagram"]
-    pub fn data_head(&mut self, head: &DataHead, payload_length: usize) -> &'static [u8] {
-        self.head(
-            kind::DATA,
-            inline_flag(&head.inline) | 4,
-            payload_length,
-            |bytes| {
-                data_head(bytes, head.reader, head.writer, head.number);
-                inline(bytes, &head.inline);
-            },
-        )
-    }
-
-    /// The last submessage of the datagram, fragments of a sample, up to their bytes. What is said of [`Self::data_head`]
-    /// holds.
+    /// The last submessage of the datagram, fragments of a sample, up to their bytes. Those are to be sent right behind the
+    /// datagram, and behind them what is returned: at most three zeros, which the submessage's length counts. Fast DDS sends
+    /// them too, and Cyclone DDS refuses a last fragment of less than four bytes.
     #[must_use = "the zeros are part of the datagram"]
     pub fn data_frag_head(&mut self, head: &DataFragHead, payload_length: usize) -> &'static [u8] {
         self.head(

@@ -1,0 +1,117 @@
+//! What goes out: answers of readers and questions of writers at once, samples when their receivers have room.
+
+use std::net::SocketAddr;
+
+use super::{Datagram, Engine};
+use crate::reader::Answer;
+use crate::wire::{self, DatagramWriter, Submessage};
+use crate::writer::Wanted;
+use crate::{EntityId, GuidPrefix};
+
+impl Engine {
+    pub(super) fn answer(&mut self, answer: Answer) {
+        let mut writer = self.datagram(answer.prefix);
+        writer.acknack(&answer.acknack);
+        for nack in &answer.nack_frags {
+            writer.nack_frag(nack);
+        }
+        self.control.push_back(Datagram::whole(answer.to, writer));
+    }
+
+    pub(super) fn datagram(&self, to: GuidPrefix) -> DatagramWriter {
+        let mut writer = DatagramWriter::new(self.own.prefix);
+        writer.destination(to);
+        writer
+    }
+
+    /// Lines up what a writer wants sent.
+    pub(super) fn enqueue(&mut self, entity: EntityId, wanted: Wanted) {
+        for (to, item) in wanted.items {
+            self.paths.entry(to).or_default().push(item);
+        }
+        let Some(writer) = self.writers.get_mut(&entity) else {
+            return;
+        };
+        let last = writer.state.last();
+        let mut out = Vec::new();
+        for (to, reader, first, asks) in wanted.heartbeats {
+            let beat = wire::Heartbeat {
+                reader: reader.entity,
+                writer: entity,
+                first,
+                last,
+                count: writer.state.count_heartbeat(),
+                is_final: !asks,
+                liveliness: false,
+            };
+            out.push((to, reader.prefix, Submessage::Heartbeat(beat)));
+        }
+        for (to, reader, start, set) in wanted.gaps {
+            let gap = wire::Gap {
+                reader: reader.entity,
+                writer: entity,
+                start,
+                set,
+            };
+            out.push((to, reader.prefix, Submessage::Gap(gap)));
+        }
+        for (to, prefix, submessage) in out {
+            let mut writer = self.datagram(prefix);
+            match &submessage {
+                Submessage::Heartbeat(beat) => writer.heartbeat(beat),
+                Submessage::Gap(gap) => writer.gap(gap),
+                _ => continue,
+            };
+            self.control.push_back(Datagram::whole(to, writer));
+        }
+    }
+
+    /// The next datagram to send; none where there is none, or where all that there are have to wait until their receivers
+    /// have room (then [`Self::is_waiting`]). `room` tells whether there is some for a datagram of so many bytes.
+    pub fn transmit(
+        &mut self,
+        room: &mut dyn FnMut(SocketAddr, usize) -> bool,
+    ) -> Option<Datagram> {
+        if let Some(datagram) = self.control.pop_front() {
+            return Some(datagram);
+        }
+        // One address after the other.
+        let after = self.next_path;
+        let order: Vec<SocketAddr> = match after {
+            Some(after) => {
+                let later = self
+                    .paths
+                    .range(after..)
+                    .map(|(to, _)| *to)
+                    .filter(|to| *to != after);
+                let earlier = self.paths.range(..=after).map(|(to, _)| *to);
+                later.chain(earlier).collect()
+            }
+            None => self.paths.keys().copied().collect(),
+        };
+        for to in order {
+            let Some(path) = self.paths.get_mut(&to) else {
+                continue;
+            };
+            let Some(length) = path.prepare(&self.writers) else {
+                self.paths.remove(&to);
+                continue;
+            };
+            if !room(to, length) {
+                continue;
+            }
+            self.next_path = Some(to);
+            if let Some(datagram) =
+                path.next(to, self.own.prefix, &mut self.writers, &mut self.control)
+            {
+                return Some(datagram);
+            }
+        }
+        None
+    }
+
+    /// Whether something waits until its receiver has room.
+    pub fn is_waiting(&self) -> bool {
+        !self.paths.is_empty()
+    }
+}
