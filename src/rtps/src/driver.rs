@@ -183,9 +183,8 @@ impl Shared {
         let Core { engine, flow, .. } = &mut *core;
         let now = Instant::now();
         flow.tidy(now);
-        match flow.bound() {
-            Ok(bound) if !bound.is_empty() => engine.ports_bound(now, &bound),
-            Ok(_) => {}
+        match flow.bound(engine.ports_to_look_at()) {
+            Ok(bound) => engine.ports_bound(now, &bound),
             Err(error) => tracing::debug!(%error, "the ports of a network namespace are not known"),
         }
     }

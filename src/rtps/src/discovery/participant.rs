@@ -18,7 +18,7 @@ const BUILTIN: u32 = 0x3f;
 /// More locators of one kind are not kept.
 pub(super) const MOST_LOCATORS: usize = 16;
 
-const KNOWN: [u16; 13] = [
+const KNOWN: [u16; 11] = [
     pid::PROTOCOL_VERSION,
     pid::VENDOR_ID,
     pid::PARTICIPANT_GUID,
@@ -27,9 +27,7 @@ const KNOWN: [u16; 13] = [
     pid::ENTITY_NAME,
     pid::USER_DATA,
     pid::METATRAFFIC_UNICAST_LOCATOR,
-    pid::METATRAFFIC_MULTICAST_LOCATOR,
     pid::DEFAULT_UNICAST_LOCATOR,
-    pid::DEFAULT_MULTICAST_LOCATOR,
     pid::BUILTIN_ENDPOINT_SET,
     pid::PARTICIPANT_LEASE_DURATION,
 ];
@@ -46,26 +44,10 @@ impl ParticipantData {
             Guid::new(self.prefix, EntityId::PARTICIPANT),
         );
         for locator in &self.discovery {
-            let multicast = is_multicast(locator);
-            list.locator(
-                if multicast {
-                    pid::METATRAFFIC_MULTICAST_LOCATOR
-                } else {
-                    pid::METATRAFFIC_UNICAST_LOCATOR
-                },
-                locator,
-            );
+            list.locator(pid::METATRAFFIC_UNICAST_LOCATOR, locator);
         }
         for locator in &self.user {
-            let multicast = is_multicast(locator);
-            list.locator(
-                if multicast {
-                    pid::DEFAULT_MULTICAST_LOCATOR
-                } else {
-                    pid::DEFAULT_UNICAST_LOCATOR
-                },
-                locator,
-            );
+            list.locator(pid::DEFAULT_UNICAST_LOCATOR, locator);
         }
         list.duration(pid::PARTICIPANT_LEASE_DURATION, self.lease);
         list.u32(pid::BUILTIN_ENDPOINT_SET, self.builtin);
@@ -82,8 +64,8 @@ impl ParticipantData {
         bytes.into()
     }
 
-    /// Of the payload of a sample, in either byte order. Shares no memory with it; of locators of one kind, the first 16
-    /// are kept. A participant in a part of its domain (`PID_DOMAIN_TAG`) is not understood.
+    /// Of the payload of a sample, in either byte order. Shares no memory with it. Locators of multicast are not kept, and of
+    /// each other kind the first 16. A participant in a part of its domain (`PID_DOMAIN_TAG`) is not understood.
     pub fn from_payload(payload: &Bytes) -> Result<Self, WireError> {
         let mut input = list(payload)?;
         let mut guid = None;
@@ -123,12 +105,8 @@ impl ParticipantData {
             }
             pid::ENTITY_NAME => self.name = String::from_utf8_lossy(value.string()?).into_owned(),
             pid::USER_DATA => self.user_data = Bytes::copy_from_slice(value.counted()?),
-            pid::METATRAFFIC_UNICAST_LOCATOR | pid::METATRAFFIC_MULTICAST_LOCATOR => {
-                keep(&mut self.discovery, value.locator()?);
-            }
-            pid::DEFAULT_UNICAST_LOCATOR | pid::DEFAULT_MULTICAST_LOCATOR => {
-                keep(&mut self.user, value.locator()?)
-            }
+            pid::METATRAFFIC_UNICAST_LOCATOR => keep(&mut self.discovery, value.locator()?),
+            pid::DEFAULT_UNICAST_LOCATOR => keep(&mut self.user, value.locator()?),
             pid::BUILTIN_ENDPOINT_SET => self.builtin = value.u32()?,
             pid::PARTICIPANT_LEASE_DURATION => self.lease = value.duration()?.finite(),
             _ => {}
@@ -142,10 +120,4 @@ pub(super) fn keep(locators: &mut Vec<Locator>, locator: Locator) {
     if locators.len() < MOST_LOCATORS {
         locators.push(locator);
     }
-}
-
-fn is_multicast(locator: &Locator) -> bool {
-    locator
-        .udp()
-        .is_some_and(|address| address.ip().is_multicast())
 }

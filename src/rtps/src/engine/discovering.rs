@@ -22,6 +22,8 @@ pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(20);
 const LAST_PAUSE: Duration = Duration::from_secs(3);
 /// How often a newcomer's port is told of us: its socket may be there before whoever reads it.
 const TOLD_AGAIN: Duration = Duration::from_millis(50);
+/// So many of the lowest free numbers of participants are looked at.
+const NUMBERS_AHEAD: usize = 6;
 /// More participants, and more ends of each, are not kept.
 const MOST_PARTICIPANTS: usize = 256;
 const MOST_ENDS: usize = 16_384;
@@ -167,21 +169,50 @@ impl Engine {
 
     // ---- ports of this machine
 
-    /// Which ports for discovery are bound in the network namespace: newcomers are told of us at once, and whose port is gone is
-    /// dead.
-    pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<u16>) {
-        let first = self.ports.discovery(0).unwrap_or(u16::MAX);
-        let last = self.ports.discovery(119).unwrap_or(u16::MAX);
-        let own: BTreeSet<u16> = self
+    /// Ports at which participants may be: those of whom we know, and those that newcomers take first.
+    pub fn ports_to_look_at(&self) -> BTreeSet<u16> {
+        let here = |remote: &Remote| {
+            remote
+                .discovery
+                .ip()
+                .is_loopback()
+                .then(|| remote.discovery.port())
+        };
+        let known: BTreeSet<u16> = self
+            .remotes
+            .values()
+            .filter_map(here)
+            .chain(self.bound.iter().copied())
+            .collect();
+        let taken = |number: &u16| {
+            self.ports
+                .discovery(*number)
+                .is_some_and(|port| known.contains(&port))
+        };
+        // Participants take the lowest number whose ports are free.
+        let free = (0..).filter(|number| !taken(number)).take(NUMBERS_AHEAD);
+        let free: Vec<u16> = free
+            .filter_map(|number| self.ports.discovery(number))
+            .collect();
+        let own = self
             .own
             .discovery
             .iter()
-            .filter_map(|locator| u16::try_from(locator.port).ok())
+            .filter_map(|locator| u16::try_from(locator.port).ok());
+        let mut ports: BTreeSet<u16> = known.into_iter().chain(free).collect();
+        own.for_each(|port| {
+            ports.remove(&port);
+        });
+        ports
+    }
+
+    /// Which of [`Self::ports_to_look_at`] are bound: newcomers are told of us at once, and whose port is gone is dead.
+    pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<u16>) {
+        let last = self.ports.discovery(119).unwrap_or(u16::MAX);
+        let found: BTreeSet<u16> = bound
+            .range(self.ports.discovery_multicast()..=last)
+            .copied()
             .collect();
-        let there = |port: &u16| {
-            (first..=last).contains(port) && (port - first) % 2 == 0 && !own.contains(port)
-        };
-        let found: BTreeSet<u16> = bound.iter().copied().filter(there).collect();
         let new: Vec<u16> = found.difference(&self.bound).copied().collect();
         if !new.is_empty() {
             for port in new {

@@ -28,10 +28,8 @@ pub(crate) mod pid {
     pub const UNICAST_LOCATOR: u16 = 0x002f;
     pub const DEFAULT_UNICAST_LOCATOR: u16 = 0x0031;
     pub const METATRAFFIC_UNICAST_LOCATOR: u16 = 0x0032;
-    pub const METATRAFFIC_MULTICAST_LOCATOR: u16 = 0x0033;
     pub const HISTORY: u16 = 0x0040;
     pub const EXPECTS_INLINE_QOS: u16 = 0x0043;
-    pub const DEFAULT_MULTICAST_LOCATOR: u16 = 0x0048;
     pub const PARTICIPANT_GUID: u16 = 0x0050;
     pub const BUILTIN_ENDPOINT_SET: u16 = 0x0058;
     pub const ENDPOINT_GUID: u16 = 0x005a;
