@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use ros::schema::{InterfaceFile, SchemaError};
+
 use crate::merged::{self, Level, Merged};
 use crate::{Error, names};
 
@@ -18,11 +20,29 @@ const MAX_FILES: usize = 20_000;
 /// Directories of a package and the files in them.
 const KINDS: [(&str, &str); 3] = [("msg", ".msg"), ("srv", ".srv"), ("action", ".action")];
 
+/// Other forms that packages of ROS 2 have interfaces in, some of them nothing else.
+struct Form {
+    extension: &'static str,
+    read: fn(&str, &str) -> Result<InterfaceFile, SchemaError>,
+}
+
+const FORMS: [Form; 2] = [
+    Form {
+        extension: ".idl",
+        read: InterfaceFile::read_idl,
+    },
+    Form {
+        extension: ".json",
+        read: InterfaceFile::read_description,
+    },
+];
+
 /// Reads all definitions below the share directories of a stack of layers.
 ///
 /// `layers` are extracted trees, lowest first. `shares` are paths in them such as `usr/share` and
 /// `opt/ros/noetic/share`; of a package that is in several of them only the definitions in the first count, as ROS
-/// itself finds them. Text that is not UTF-8 (in comments) is replaced.
+/// itself finds them. Text that is not UTF-8 (in comments) is replaced. IDL and descriptions of types become texts in the
+/// language of `.msg`, where a package has no such file.
 pub fn read<L: AsRef<Path>, S: AsRef<str>>(
     layers: &[L],
     shares: &[S],
@@ -69,19 +89,28 @@ impl Reader {
     fn package(&mut self, package: &str, directory: &Merged) -> Result<(), Error> {
         for (kind, extension) in KINDS {
             let merged = directory.below(kind.as_bytes())?;
-            for (name, level) in merged.names()? {
-                let Ok(name) = String::from_utf8(name) else {
-                    continue;
-                };
-                let Some(of_type) = name
-                    .strip_suffix(extension)
-                    .filter(|name| names::is_type(name))
-                else {
-                    continue;
-                };
-                if let Some(text) = self.file(level, &name)? {
+            let files = merged.names()?;
+            for (level, name, of_type) in ending(&files, extension) {
+                if let Some(text) = self.file(level, name)? {
                     self.definitions
                         .insert(format!("{package}/{kind}/{of_type}"), text);
+                }
+            }
+            for form in FORMS {
+                for (level, name, of_type) in ending(&files, form.extension) {
+                    let key = format!("{package}/{kind}/{of_type}");
+                    if self.definitions.contains_key(&key) {
+                        continue;
+                    }
+                    let Some(text) = self.file(level, name)? else {
+                        continue;
+                    };
+                    // What cannot be read is missed where it is needed, and named there.
+                    if let Ok(read) = (form.read)(&key, &text)
+                        && let Some(text) = read.definitions.get(&key)
+                    {
+                        self.definitions.insert(key, text.clone());
+                    }
                 }
             }
         }
@@ -104,6 +133,18 @@ impl Reader {
         }
         Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
     }
+}
+
+/// Files with an extension and a name of a type, which is given without it.
+fn ending<'a>(
+    files: &'a BTreeMap<Vec<u8>, &'a Level>,
+    extension: &'a str,
+) -> impl Iterator<Item = (&'a Level, &'a str, &'a str)> {
+    files.iter().filter_map(move |(name, level)| {
+        let name = std::str::from_utf8(name).ok()?;
+        let of_type = name.strip_suffix(extension)?;
+        names::is_type(of_type).then_some((*level, name, of_type))
+    })
 }
 
 #[cfg(test)]
@@ -169,6 +210,32 @@ mod tests {
             ("std_srvs/srv/Empty", "---"),
         ];
         assert_eq!(list(&found), expected);
+    }
+
+    /// As rosidl writes them beside each other.
+    const IDL: &str = "module p { module msg { struct Point { double x; double y; }; }; };";
+    const DESCRIPTION: &str = r#"{"type_description_msg": {"type_description": {"type_name": "p/msg/Count",
+        "fields": [{"name": "n", "type": {"type_id": 6, "capacity": 0, "string_capacity": 0,
+        "nested_type_name": ""}, "default_value": "7"}]}, "referenced_type_descriptions": []}}"#;
+
+    #[test]
+    fn other_forms_of_ros_2_count_where_there_is_no_text() {
+        let layers = Layers::new();
+        layers
+            .write("base/usr/share/p/msg/Point.idl", IDL)
+            .write("base/usr/share/p/msg/Count.json", DESCRIPTION)
+            .write("base/usr/share/p/msg/Both.msg", "int8 of_text")
+            .write("base/usr/share/p/msg/Both.idl", IDL)
+            .write("base/usr/share/p/msg/Torn.idl", "module p {")
+            .write("base/usr/share/p/srv/readme.json", "{}");
+        let found = layers.read(&["base"]).unwrap();
+        let names: Vec<_> = found.keys().map(String::as_str).collect();
+        assert_eq!(names, ["p/msg/Both", "p/msg/Count", "p/msg/Point"]);
+        assert_eq!(found["p/msg/Both"], "int8 of_text");
+        assert_eq!(found["p/msg/Count"], "int32 n 7\n");
+        let registry =
+            ros::schema::Registry::of_definitions(ros::bus::RosVersion::Two, &found).unwrap();
+        assert_eq!(registry.message("p/msg/Point").unwrap().fields().len(), 2);
     }
 
     #[test]

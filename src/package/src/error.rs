@@ -69,7 +69,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// Two packages of one name.
-    #[error("two packages are named {name:?}: {} and {}; remove one, or put a CATKIN_IGNORE file beside it", .first.display(), .second.display())]
+    #[error("two packages are named {name:?}: {} and {}; remove one, or put a file COLCON_IGNORE (or CATKIN_IGNORE) beside it", .first.display(), .second.display())]
     SameName {
         /// The name.
         name: String,
@@ -77,6 +77,58 @@ pub enum Error {
         first: PathBuf,
         /// The second directory of that name.
         second: PathBuf,
+    },
+    /// A space that leads back to where it was built.
+    #[error("{} was built with --symlink-install: {} leads to the workspace, which is not there; build it without, or push the workspace", .path.display(), .hook.display())]
+    SymlinkInstall {
+        /// The install space.
+        path: PathBuf,
+        /// What leads there.
+        hook: PathBuf,
+    },
+    /// Packages of both versions of ROS.
+    #[error(
+        "packages of both versions of ROS cannot be in one service: {first} (ROS {first_version}), and {second} (ROS {second_version}); push them apart, or put a COLCON_IGNORE file beside the package.xml of one"
+    )]
+    TwoFlavours {
+        /// A package, and what makes it one of its version: `talker has build type catkin`.
+        first: String,
+        /// 1 or 2.
+        first_version: u8,
+        /// The other.
+        second: String,
+        /// 1 or 2.
+        second_version: u8,
+    },
+    /// A build type that nothing here builds.
+    #[error(
+        "{}: build type {build_type} is built by no base; those that can be built are catkin (ROS 1), ament_cmake and ament_python (ROS 2), and cmake", .path.display()
+    )]
+    BuildType {
+        /// The package.xml.
+        path: PathBuf,
+        /// What it says.
+        build_type: String,
+    },
+    /// A package of ROS 2 that counts as one of catkin.
+    #[error(
+        "{}: it is built with {tool}, but says no build type, which means catkin; add <export><build_type>{build_type}</build_type></export>", .path.display()
+    )]
+    NoBuildType {
+        /// The package.xml.
+        path: PathBuf,
+        /// Such as `ament_cmake` or `rosidl`.
+        tool: String,
+        /// What it should say.
+        build_type: &'static str,
+    },
+    /// An interface file that cannot be used.
+    #[error("{}: {problem}", .path.display())]
+    Definition {
+        /// The `.msg`, `.srv`, `.action` or `.idl`.
+        path: PathBuf,
+        /// What is wrong with it, its line where there is one, and what to do.
+        problem: String,
     },
     /// Packages that need each other to be built.
     #[error("packages need each other to be built: {}; break the circle in their package.xml", .circle.join(" needs "))]

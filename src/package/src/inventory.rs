@@ -1,6 +1,8 @@
 //! What an image holds: install spaces, ROS packages with their programs, message definitions. It is looked for once, when a
 //! revision is published, and recorded with it; nobody searches layers afterwards.
 
+mod launch;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
@@ -8,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::definitions::{self, Definitions};
 use crate::merged::{self, Level, Merged};
-use crate::{Error, names};
+use crate::{Error, ament, names};
 
 /// Links that are followed from one to the next.
 const MAX_LINKS: usize = 8;
@@ -38,6 +40,12 @@ pub struct Installed {
     pub lib: String,
     /// Names of the programs there.
     pub executables: BTreeSet<String>,
+    /// Launch files, by their paths below `share`.
+    #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
+    pub launch_files: BTreeSet<String>,
+    /// Classes of nodes for component containers (ROS 2), each with its library's absolute path.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub components: BTreeMap<String, String>,
 }
 
 /// What a revision says of itself, which tells where to look.
@@ -74,7 +82,8 @@ fn prefixes(stack: &[Level], of: Published<'_>) -> Result<Vec<String>, Error> {
             .map_or("", String::as_str)
             .split(':')
     };
-    let mut named: Vec<String> = variable("CMAKE_PREFIX_PATH").map(str::to_owned).collect();
+    let spaces = variable("AMENT_PREFIX_PATH").chain(variable("CMAKE_PREFIX_PATH"));
+    let mut named: Vec<String> = spaces.map(str::to_owned).collect();
     let shares = variable("ROS_PACKAGE_PATH").filter_map(|share| share.strip_suffix("/share"));
     named.extend(shares.map(str::to_owned));
     // PREFIX/lib/PACKAGE/PROGRAM
@@ -128,22 +137,36 @@ fn packages(stack: &[Level], prefixes: &[String]) -> Result<BTreeMap<String, Ins
     let mut packages: BTreeMap<String, Installed> = BTreeMap::new();
     for prefix in prefixes {
         let share = Merged::at(stack, &format!("{prefix}/share"))?;
-        for name in share.names()?.into_keys() {
-            let Ok(name) = String::from_utf8(name) else {
-                continue;
-            };
-            if !names::is_package(&name) || packages.contains_key(&name) {
+        let indexed = ament::packages_in(stack, prefix)?;
+        let named = share.names()?.into_keys();
+        let mut named: BTreeSet<String> = named
+            .filter_map(|name| String::from_utf8(name).ok())
+            .filter(|name| names::is_package(name) && !indexed.contains(name))
+            .collect();
+        named.extend(indexed.iter().cloned());
+        for name in named {
+            if packages.contains_key(&name) {
                 continue;
             }
             let own = share.below(name.as_bytes())?;
-            if own.names()?.contains_key(b"package.xml".as_slice()) {
-                let share = format!("{prefix}/share/{name}");
-                let installed = Installed {
-                    share,
-                    ..Installed::default()
-                };
-                packages.insert(name, installed);
+            let is_package = own.names()?.contains_key(b"package.xml".as_slice());
+            if !is_package && !indexed.contains(&name) {
+                continue;
             }
+            let components = match indexed.contains(&name) {
+                true => ament::components(stack, prefix, &name)?,
+                false => Vec::new(),
+            };
+            let components = components.into_iter();
+            let installed = Installed {
+                share: format!("{prefix}/share/{name}"),
+                launch_files: launch::files(&own)?,
+                components: components
+                    .map(|(class, library)| (class, format!("{prefix}/{library}")))
+                    .collect(),
+                ..Installed::default()
+            };
+            packages.insert(name, installed);
         }
     }
     for prefix in prefixes {

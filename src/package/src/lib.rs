@@ -13,13 +13,18 @@
 
 #![forbid(unsafe_code)]
 
+pub mod ament;
 pub mod condition;
 pub mod definitions;
 pub mod difference;
 mod error;
+pub mod fits;
+mod install_space;
 pub mod interface;
 mod interface_toml;
+pub mod interfaces;
 pub mod inventory;
+mod locate;
 pub mod manifest;
 mod merged;
 pub mod names;

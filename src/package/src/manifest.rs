@@ -8,8 +8,11 @@ use roxmltree::{Document, Node};
 use crate::condition::Variables;
 use crate::{Error, names, read};
 
+/// The group of packages from whose `.msg`, `.srv` and `.action` files rosidl makes code.
+pub const INTERFACES: &str = "rosidl_interface_packages";
+
 /// The largest `package.xml` that is read.
-const MAX_BYTES: u64 = 1 << 20;
+pub(crate) const MAX_BYTES: u64 = 1 << 20;
 
 /// What a package says about itself, for the distribution its conditions were evaluated for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,6 +31,10 @@ pub struct Manifest {
     pub dependencies: BTreeSet<Dependency>,
     /// `catkin` unless exported otherwise.
     pub build_type: String,
+    /// Groups that it says it is a member of, such as [`INTERFACES`] (format 3).
+    pub groups: BTreeSet<String>,
+    /// Groups all of whose members it needs to be built (format 3).
+    pub group_dependencies: BTreeSet<String>,
     /// It only groups others.
     pub metapackage: bool,
 }
@@ -101,6 +108,11 @@ impl Manifest {
         reader.manifest()
     }
 
+    /// Whether it needs a group that another package is a member of.
+    pub fn needs_group_of(&self, other: &Self) -> bool {
+        !self.group_dependencies.is_disjoint(&other.groups)
+    }
+
     /// Names of what is needed for any of `kinds`.
     pub fn needs(&self, kinds: &[Kind]) -> BTreeSet<&str> {
         let wanted = self
@@ -161,6 +173,8 @@ impl<'a> Reader<'a> {
             .collect();
         let dependencies = self.dependencies(root, format)?;
         let (build_type, metapackage) = self.export(root)?;
+        let groups = self.groups(root, "member_of_group", format)?;
+        let group_dependencies = self.groups(root, "group_depend", format)?;
         Ok(Manifest {
             format,
             name,
@@ -169,6 +183,8 @@ impl<'a> Reader<'a> {
             licenses,
             dependencies,
             build_type,
+            groups,
+            group_dependencies,
             metapackage,
         })
     }
@@ -224,6 +240,30 @@ impl<'a> Reader<'a> {
             }));
         }
         Ok(dependencies)
+    }
+
+    /// Names of groups in elements of a name.
+    fn groups(
+        &self,
+        root: Node<'a, 'a>,
+        element: &str,
+        format: u8,
+    ) -> Result<BTreeSet<String>, Error> {
+        let nodes = match format {
+            3.. => self.children(root, element)?,
+            _ => Vec::new(),
+        };
+        let named = nodes.into_iter().map(|node| {
+            let name = self.text(node);
+            match names::is_dependency(&name) {
+                true => Ok(name),
+                false => Err(self.wrong(
+                    node,
+                    format!("{name:?} in <{element}> is not the name of a group"),
+                )),
+            }
+        });
+        named.collect()
     }
 
     fn export(&self, root: Node<'a, 'a>) -> Result<(String, bool), Error> {
@@ -381,6 +421,69 @@ mod tests {
         .unwrap();
         assert_eq!(needs(&manifest, Kind::Exec), ["python3-numpy", "roscpp"]);
         assert_eq!(manifest.build_type, "catkin");
+    }
+
+    /// As packages for both versions of ROS are written.
+    const OF_BOTH: &str = r#"<?xml version="1.0"?>
+        <package format="3">
+          <name>both_msgs</name><version>1.0.0</version>
+          <buildtool_depend condition="$ROS_VERSION == 1">catkin</buildtool_depend>
+          <buildtool_depend condition="$ROS_VERSION == 2">ament_cmake</buildtool_depend>
+          <buildtool_depend condition="$ROS_VERSION == 2">rosidl_default_generators</buildtool_depend>
+          <build_depend condition="$ROS_VERSION == 1">message_generation</build_depend>
+          <depend>std_msgs</depend>
+          <exec_depend condition="$ROS_DISTRO >= iron and $ROS_VERSION == 2">new_one</exec_depend>
+          <exec_depend condition="$ROS_VERSION == 2">rosidl_default_runtime</exec_depend>
+          <member_of_group condition="$ROS_VERSION == 2">rosidl_interface_packages</member_of_group>
+          <export condition="$ROS_VERSION == 1"><build_type>catkin</build_type></export>
+          <export condition="$ROS_VERSION == 2"><build_type>ament_cmake</build_type></export>
+        </package>"#;
+
+    #[test]
+    fn one_manifest_for_both_versions() {
+        let read = |version, distribution| {
+            let variables = Variables::ros(version, distribution);
+            Manifest::parse(OF_BOTH, Path::new("package.xml"), &variables).unwrap()
+        };
+        let one = read(1, "noetic");
+        assert_eq!(one.build_type, "catkin");
+        assert_eq!(needs(&one, Kind::Buildtool), ["catkin"]);
+        assert_eq!(needs(&one, Kind::Exec), ["std_msgs"]);
+        assert!(one.groups.is_empty());
+        let two = read(2, "jazzy");
+        assert_eq!(two.build_type, "ament_cmake");
+        assert_eq!(
+            needs(&two, Kind::Buildtool),
+            ["ament_cmake", "rosidl_default_generators"]
+        );
+        assert_eq!(
+            needs(&two, Kind::Exec),
+            ["new_one", "rosidl_default_runtime", "std_msgs"]
+        );
+        assert_eq!(two.groups, BTreeSet::from([INTERFACES.to_owned()]));
+        assert!(!needs(&read(2, "humble"), Kind::Exec).contains(&"new_one"));
+    }
+
+    #[test]
+    fn groups_are_of_format_3() {
+        let text = |format: u8| {
+            format!(
+                "<package format='{format}'><name>x</name><group_depend>g</group_depend>\
+                 <member_of_group>h</member_of_group></package>"
+            )
+        };
+        let manifest = parse(&text(3)).unwrap();
+        assert_eq!(
+            manifest.group_dependencies,
+            BTreeSet::from(["g".to_owned()])
+        );
+        assert_eq!(manifest.groups, BTreeSet::from(["h".to_owned()]));
+        let manifest = parse(&text(2)).unwrap();
+        assert!(manifest.group_dependencies.is_empty() && manifest.groups.is_empty());
+        let message = refused(
+            "<package format='3'><name>x</name><member_of_group>../g</member_of_group></package>",
+        );
+        assert!(message.contains("not the name of a group"), "{message}");
     }
 
     #[test]

@@ -46,6 +46,13 @@ impl Level {
         })
     }
 
+    /// Whether a name in this part says that the layers below have nothing of it.
+    pub(crate) fn is_deletion(&self, name: &[u8]) -> bool {
+        let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
+        rustix::fs::statat(self.0.as_fd(), name, flags)
+            .is_ok_and(|stat| FileType::from_raw_mode(stat.st_mode) == FileType::CharacterDevice)
+    }
+
     /// Where a link in this part leads, unless it is none.
     pub(crate) fn link(&self, name: &[u8]) -> Option<PathBuf> {
         let target = rustix::fs::readlinkat(self.0.as_fd(), name, Vec::new()).ok()?;

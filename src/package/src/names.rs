@@ -34,10 +34,25 @@ pub fn is_executable(name: &str) -> bool {
             .all(|c| !c.is_control() && !"'\"`$\\/".contains(c))
 }
 
-/// `package/Type`.
+/// A C++ class in its namespaces, such as `image_tools::ShowImage`.
+pub fn is_class(name: &str) -> bool {
+    name.len() <= 512 && name.split("::").all(is_type)
+}
+
+/// A library's path in an install space, such as `lib/libtalker.so`.
+pub fn is_library(path: &str) -> bool {
+    path.len() <= 512 && path.split('/').all(is_executable)
+}
+
+/// `package/Type`, or `package/msg/Type` as ROS 2 has it.
 pub fn is_full_type(name: &str) -> bool {
-    name.split_once('/')
-        .is_some_and(|(package, of_it)| is_package(package) && is_type(of_it))
+    let parts: Vec<&str> = name.splitn(4, '/').collect();
+    match parts[..] {
+        [package, of_it] | [package, "msg" | "srv" | "action", of_it] => {
+            is_package(package) && is_type(of_it)
+        }
+        _ => false,
+    }
 }
 
 /// An absolute graph name such as `/camera/image_raw`.
@@ -66,6 +81,17 @@ mod tests {
         assert!(is_dependency("libstdc++6") && !is_dependency("-oDir=/") && !is_dependency("a;b"));
         assert!(
             is_full_type("sensor_msgs/Image") && !is_full_type("Image") && !is_full_type("a/b/C")
+        );
+        assert!(
+            is_full_type("sensor_msgs/msg/Image")
+                && is_full_type("a/srv/B")
+                && is_full_type("a/action/B")
+                && !is_full_type("a/msg/b/C")
+                && !is_full_type("a/msg/")
+        );
+        assert!(is_class("image_tools::ShowImage") && !is_class("a::") && !is_class("a b"));
+        assert!(
+            is_library("lib/libx.so") && !is_library("/lib/libx.so") && !is_library("lib/../x")
         );
         assert!(
             is_graph_name("/camera/image_raw") && is_graph_name("/_x") && !is_graph_name("image")

@@ -38,9 +38,16 @@ pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error>
 }
 
 /// Names of waiting packages that must come before this one.
-fn needed<'a>(package: &'a Package, waiting: &BTreeMap<String, Package>) -> BTreeSet<&'a str> {
-    let mut names = package.manifest.needs(&BEFORE);
-    names.retain(|name| *name != package.manifest.name && waiting.contains_key(*name));
+fn needed<'a>(package: &'a Package, waiting: &'a BTreeMap<String, Package>) -> BTreeSet<&'a str> {
+    let own = &package.manifest;
+    let mut names = own.needs(&BEFORE);
+    names.retain(|name| waiting.contains_key(*name));
+    if !own.group_dependencies.is_empty() {
+        let others = waiting.values().map(|package| &package.manifest);
+        let members = others.filter(|other| own.needs_group_of(other));
+        names.extend(members.map(|other| other.name.as_str()));
+    }
+    names.remove(own.name.as_str());
     names
 }
 

@@ -98,6 +98,7 @@ fn packages_have_directories_and_programs() {
         share: share.into(),
         lib: lib.into(),
         executables: executables.iter().map(|name| (*name).to_owned()).collect(),
+        ..Installed::default()
     };
     let expected = [
         (
@@ -185,4 +186,93 @@ fn a_prefix_cannot_lead_out_of_the_layers() {
     let many: Vec<String> = (0..10_000).map(|number| format!("/{number}")).collect();
     let taken = layers.take(&[("CMAKE_PREFIX_PATH", &many.join(":"))], &[]);
     assert_eq!(taken.prefixes, Vec::<String>::new());
+}
+
+/// Packages of ROS 2 in a merged space, one in an isolated space, and a base below `/opt/ros`.
+fn layers_of_two() -> Layers {
+    let layers = Layers(tempfile::tempdir().expect("a directory"));
+    let index = "share/ament_index/resource_index";
+    for (prefix, name) in [
+        ("low/opt/ros/jazzy", "std_msgs"),
+        ("high/opt/mine", "p"),
+        ("high/opt/mine", "unshared"),
+        ("high/opt/apart/q", "q"),
+    ] {
+        layers.file(&format!("{prefix}/{index}/packages/{name}"), 0o644);
+    }
+    layers
+        .file("low/opt/ros/jazzy/share/std_msgs/package.xml", 0o644)
+        .file("low/opt/ros/jazzy/share/std_msgs/msg/String.msg", 0o644)
+        .file("high/opt/mine/share/p/package.xml", 0o644)
+        .file("high/opt/mine/share/p/msg/Said.msg", 0o644)
+        .file("high/opt/mine/share/p/launch/up.launch.py", 0o644)
+        .file("high/opt/mine/share/p/launch/deep/all.yaml", 0o644)
+        .file("high/opt/mine/share/p/launch/notes.txt", 0o644)
+        .file("high/opt/mine/share/p/top_launch.xml", 0o644)
+        .file("high/opt/mine/share/p/params.yaml", 0o644)
+        // What console_scripts of setup.py become.
+        .file("high/opt/mine/lib/p/talker", 0o755)
+        .file(
+            "high/opt/mine/lib/python3.11/site-packages/p/talker.py",
+            0o644,
+        )
+        .file("high/opt/apart/q/share/q/package.xml", 0o644)
+        .file("high/opt/apart/q/lib/q/run", 0o755);
+    layers
+}
+
+const OF_TWO: (&str, &str) = ("AMENT_PREFIX_PATH", "/opt/mine:/opt/apart/q:/opt/ros/jazzy");
+
+#[test]
+fn packages_of_ros_2_are_those_of_aments_index() {
+    let taken = layers_of_two().take(&[OF_TWO, ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy")], &[]);
+    assert_eq!(
+        taken.prefixes[..3],
+        ["/opt/mine", "/opt/apart/q", "/opt/ros/jazzy"]
+    );
+    let names: Vec<&str> = taken.packages.keys().map(String::as_str).collect();
+    assert_eq!(names, ["p", "q", "std_msgs", "unshared"]);
+    let own = &taken.packages["p"];
+    assert_eq!(
+        (&*own.share, &*own.lib),
+        ("/opt/mine/share/p", "/opt/mine/lib/p")
+    );
+    assert_eq!(own.executables, ["talker".to_owned()].into());
+    let launch: Vec<&str> = own.launch_files.iter().map(String::as_str).collect();
+    assert_eq!(
+        launch,
+        [
+            "launch/deep/all.yaml",
+            "launch/up.launch.py",
+            "top_launch.xml"
+        ]
+    );
+    assert_eq!(taken.packages["q"].lib, "/opt/apart/q/lib/q");
+    let keys: Vec<&String> = taken.definitions.keys().collect();
+    assert_eq!(keys, ["p/msg/Said", "std_msgs/msg/String"]);
+}
+
+#[test]
+fn component_libraries_are_told() {
+    let layers = layers_of_two();
+    let path = "high/opt/mine/share/ament_index/resource_index/rclcpp_components/p";
+    let text = "p::Talker;lib/libtalker.so\np::Bad;../../etc/shadow\nnonsense\nrm -rf;lib/x.so\n\
+                p::ns::Other;lib/libtalker.so\n";
+    std::fs::write(layers.place(path), text).expect("written");
+    let taken = layers.take(&[OF_TWO], &[]);
+    let expected = [
+        ("p::Talker", "/opt/mine/lib/libtalker.so"),
+        ("p::ns::Other", "/opt/mine/lib/libtalker.so"),
+    ];
+    let expected = expected.map(|(class, library)| (class.to_owned(), library.to_owned()));
+    assert_eq!(taken.packages["p"].components, expected.into());
+    assert!(taken.packages["q"].components.is_empty());
+}
+
+#[test]
+fn what_an_earlier_version_recorded_is_read() {
+    let recorded = r#"{"share":"/usr/share/p","lib":"/usr/lib/p","executables":["node"]}"#;
+    let read: Installed = serde_json::from_str(recorded).expect("read");
+    assert!(read.launch_files.is_empty() && read.components.is_empty());
+    assert_eq!(serde_json::to_string(&read).expect("written"), recorded);
 }

@@ -155,6 +155,7 @@ mod tests {
                 share: "/usr/share/p".into(),
                 lib: "/usr/lib/p".into(),
                 executables: ["node".to_owned()].into(),
+                ..Installed::default()
             };
             Contents::read(&layers, &package).expect("read")
         }

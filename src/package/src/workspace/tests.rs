@@ -311,3 +311,156 @@ fn a_devel_space_and_an_empty_install_space_are_refused() {
         place.refused()
     );
 }
+
+/// What colcon's `local_setup.sh` says of where it is.
+const COLCON: &str = "# generated\n_colcon_prefix_sh_COLCON_CURRENT_PREFIX=\"/home/me/ws/install\"\n\
+                      if [ -z \"$COLCON_CURRENT_PREFIX\" ]; then\n";
+/// What colcon's `setup.sh` says.
+const COLCON_CHAIN: &str = "_colcon_prefix_chain_sh_COLCON_CURRENT_PREFIX=/home/me/ws/install\n";
+/// What ament's own `local_setup.sh` says.
+const AMENT: &str = ": ${AMENT_CURRENT_PREFIX:=\"/opt/mine\"}\n";
+
+impl Place {
+    /// A package of ROS 2 in a prefix.
+    fn indexed(&self, prefix: &str, name: &str) -> &Self {
+        self.write(
+            &format!("{prefix}share/ament_index/resource_index/packages/{name}"),
+            "",
+        )
+        .package(&format!("{prefix}share/{name}"), name, &[])
+    }
+
+    fn space(&self) -> InstallSpace {
+        match self.inspect().unwrap() {
+            Pushed::Installed(space) => space,
+            Pushed::Source(_) => panic!("not an install space"),
+        }
+    }
+}
+
+#[test]
+fn install_spaces_of_ros_2_in_either_layout() {
+    for below in ["", "install/"] {
+        for (layout, script, text, prefix) in [
+            (
+                Layout::Merged,
+                "local_setup.sh",
+                COLCON,
+                Some("/home/me/ws/install"),
+            ),
+            (
+                Layout::Merged,
+                "setup.sh",
+                COLCON_CHAIN,
+                Some("/home/me/ws/install"),
+            ),
+            (Layout::Merged, "local_setup.sh", AMENT, Some("/opt/mine")),
+            (Layout::Merged, "README", "no script at all", None),
+            (
+                Layout::Isolated,
+                "local_setup.sh",
+                COLCON,
+                Some("/home/me/ws/install"),
+            ),
+        ] {
+            let place = Place::new();
+            place.write(&format!("{below}{script}"), text);
+            for name in ["b", "a"] {
+                let of_package = match layout {
+                    Layout::Isolated => format!("{below}{name}/"),
+                    _ => below.to_owned(),
+                };
+                place.indexed(&of_package, name);
+            }
+            let space = place.space();
+            assert_eq!(space.layout, layout, "{below}{script}");
+            assert_eq!(space.layout.version(), ros::bus::RosVersion::Two);
+            assert_eq!(space.prefix.as_deref(), prefix.map(Path::new), "{text}");
+            assert_eq!(
+                space.root,
+                place.0.path().canonicalize().unwrap().join(below)
+            );
+            let paths: Vec<_> = space.packages.iter().map(|p| p.path.clone()).collect();
+            let expected = match layout {
+                Layout::Isolated => ["a/share/a", "b/share/b"],
+                _ => ["share/a", "share/b"],
+            };
+            assert_eq!(paths, expected.map(PathBuf::from));
+        }
+    }
+}
+
+#[test]
+fn sources_side_by_side_are_no_isolated_space() {
+    let place = Place::new();
+    // A repository may hold an index among its tests.
+    place
+        .package("a", "a", &[])
+        .write("b/share/ament_index/resource_index/packages/x", "")
+        .package("b", "b", &[]);
+    assert_eq!(place.found(), pairs(&[("a", "a"), ("b", "b")]));
+}
+
+#[test]
+fn a_space_that_leads_back_to_its_sources_is_refused() {
+    let place = Place::new();
+    place
+        .indexed("", "talker")
+        .write("local_setup.sh", COLCON)
+        .write("share/talker/hook/pythonpath_develop.sh", "");
+    let text = place.refused();
+    assert!(
+        text.contains("--symlink-install") && text.contains("push the workspace"),
+        "{text}"
+    );
+}
+
+#[test]
+fn an_index_without_package_xml_is_no_package() {
+    let place = Place::new();
+    place.write("share/ament_index/resource_index/packages/x", "");
+    assert!(
+        place.refused().contains("without a share/*/package.xml"),
+        "{}",
+        place.refused()
+    );
+}
+
+#[test]
+fn members_of_a_group_come_before_those_that_need_it() {
+    let place = Place::new();
+    let write = |name: &str, rest: &str| {
+        let text = format!("<package format='3'><name>{name}</name>{rest}</package>");
+        place.write(&format!("src/{name}/package.xml"), &text);
+    };
+    write(
+        "a_bridge",
+        "<group_depend>rosidl_interface_packages</group_depend>",
+    );
+    write(
+        "z_msgs",
+        "<member_of_group>rosidl_interface_packages</member_of_group>",
+    );
+    write(
+        "m_msgs",
+        "<member_of_group>rosidl_interface_packages</member_of_group>",
+    );
+    let expected = [
+        ("m_msgs", "src/m_msgs"),
+        ("z_msgs", "src/z_msgs"),
+        ("a_bridge", "src/a_bridge"),
+    ];
+    assert_eq!(place.found(), pairs(&expected));
+    // A member that needs the group needs the others, and not itself.
+    write(
+        "m_msgs",
+        "<member_of_group>rosidl_interface_packages</member_of_group>\
+         <group_depend>rosidl_interface_packages</group_depend>",
+    );
+    let expected = [
+        ("z_msgs", "src/z_msgs"),
+        ("m_msgs", "src/m_msgs"),
+        ("a_bridge", "src/a_bridge"),
+    ];
+    assert_eq!(place.found(), pairs(&expected));
+}

@@ -1,0 +1,87 @@
+//! Ament's index: which packages an install space of ROS 2 has, and what else packages have registered there
+//! (`share/ament_index/resource_index/KIND/PACKAGE`).
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use crate::merged::{self, Level, Merged};
+use crate::{Error, names};
+
+const INDEX: &str = "share/ament_index/resource_index";
+/// The largest resource that is read.
+const MAX_BYTES: u64 = 64 << 10;
+/// Component classes of one package.
+const MAX_COMPONENTS: usize = 1000;
+
+/// Names of packages in the indexes of these install spaces (absolute paths in the layers). `layers` are extracted trees,
+/// lowest first. Blocking.
+pub fn packages<L: AsRef<Path>, P: AsRef<str>>(
+    layers: &[L],
+    prefixes: &[P],
+) -> Result<BTreeSet<String>, Error> {
+    let stack = merged::open(layers)?;
+    let mut found = BTreeSet::new();
+    for prefix in prefixes {
+        found.extend(packages_in(&stack, prefix.as_ref())?);
+    }
+    Ok(found)
+}
+
+pub(crate) fn packages_in(stack: &[Level], prefix: &str) -> Result<BTreeSet<String>, Error> {
+    let index = Merged::at(stack, &format!("{prefix}/{INDEX}/packages"))?;
+    let names = index.names()?.into_keys();
+    let names = names.filter_map(|name| String::from_utf8(name).ok());
+    Ok(names.filter(|name| names::is_package(name)).collect())
+}
+
+/// Classes of nodes that a package's libraries have for component containers (`rclcpp_components`): each with its library,
+/// relative to the install space.
+pub(crate) fn components(
+    stack: &[Level],
+    prefix: &str,
+    package: &str,
+) -> Result<Vec<(String, String)>, Error> {
+    let index = Merged::at(stack, &format!("{prefix}/{INDEX}/rclcpp_components"))?;
+    let names = index.names()?;
+    let Some(level) = names.get(package.as_bytes()) else {
+        return Ok(Vec::new());
+    };
+    let Some(file) = level.file(package.as_bytes(), MAX_BYTES)? else {
+        return Ok(Vec::new());
+    };
+    let text = String::from_utf8_lossy(&file.bytes);
+    let lines = text.lines().filter_map(|line| line.split_once(';'));
+    let good =
+        lines.filter(|(class, library)| names::is_class(class) && names::is_library(library));
+    let owned = good.map(|(class, library)| (class.to_owned(), library.to_owned()));
+    Ok(owned.take(MAX_COMPONENTS).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn packages_of_all_spaces_and_layers_are_found() {
+        let root = tempfile::tempdir().expect("a directory");
+        let write = |path: &str| {
+            let path = root.path().join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, "").expect("written");
+        };
+        for (prefix, name) in [
+            ("low/opt/ros/jazzy", "rclpy"),
+            ("high/opt/ros/jazzy", "std_msgs"),
+            ("high/opt/mine", "p"),
+            ("high/opt/mine", "no name"),
+            ("high/opt/hidden", "q"),
+        ] {
+            write(&format!("{prefix}/{INDEX}/packages/{name}"));
+        }
+        let layers = ["low", "high"].map(|layer| root.path().join(layer));
+        let found = packages(&layers, &["/opt/ros/jazzy", "/opt/mine", "/opt/none"]);
+        let found = found.expect("read");
+        let names: Vec<&str> = found.iter().map(String::as_str).collect();
+        assert_eq!(names, ["p", "rclpy", "std_msgs"]);
+    }
+}
