@@ -2,11 +2,12 @@
 
 use std::io;
 use std::net::SocketAddr;
+use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
 use async_trait::async_trait;
 use servant::netns::NetNs;
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
 
 /// Sockets inside one servant.
 #[derive(Debug, Clone)]
@@ -31,5 +32,13 @@ impl ros::net::Sockets for ServantSockets {
 
     async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
         self.netns.listen(address).await
+    }
+
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        self.netns.datagrams(address, shared).await
+    }
+
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        self.netns.diagnostics().await.map(Some)
     }
 }

@@ -3,12 +3,13 @@
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use socket2::{SockRef, TcpKeepalive};
-use tokio::net::{TcpListener, TcpStream};
+use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
@@ -25,7 +26,25 @@ pub trait Sockets: Send + Sync + 'static {
         let ip = literal(host).unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
         Ok(SocketAddr::new(ip, port))
     }
+    /// A UDP socket bound to `address` as seen from inside; port 0 picks a free one. With `shared` others may be bound to it,
+    /// too, for multicast.
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        let _ = shared;
+        let what = format!("no datagrams can be received at {address} here");
+        Err(io::Error::new(io::ErrorKind::Unsupported, what))
+    }
+    /// A socket by which the kernel tells of the sockets of this place (`NETLINK_SOCK_DIAG`, sock_diag(7)); none where it
+    /// cannot be had.
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        Ok(None)
+    }
 }
+
+/// For datagrams that have come and were not read yet: pictures come faster than they are read.
+const DATAGRAMS: usize = 8 << 20;
+/// Of netlink(7) and sock_diag(7).
+const AF_NETLINK: i32 = 16;
+const NETLINK_SOCK_DIAG: i32 = 4;
 
 /// A peer that has said nothing for so long is asked whether it is there.
 const ASK: Duration = Duration::from_secs(20);
@@ -120,6 +139,25 @@ impl Sockets for HostSockets {
         TcpListener::bind(address).await
     }
 
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        let socket = Socket::new(
+            Domain::for_address(address),
+            Type::DGRAM.nonblocking(),
+            None,
+        )?;
+        // As much as the machine allows to everybody.
+        socket.set_recv_buffer_size(DATAGRAMS)?;
+        socket.set_reuse_address(shared)?;
+        socket.bind(&address.into())?;
+        UdpSocket::from_std(socket.into())
+    }
+
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        let (domain, kind) = (Domain::from(AF_NETLINK), Type::RAW.nonblocking().cloexec());
+        let socket = Socket::new(domain, kind, Some(Protocol::from(NETLINK_SOCK_DIAG)))?;
+        Ok(Some(socket.into()))
+    }
+
     async fn resolve(&self, host: &str, port: u16) -> io::Result<SocketAddr> {
         if let Some(ip) = literal(host) {
             return Ok(SocketAddr::new(ip, port));
@@ -149,11 +187,32 @@ impl Sockets for LoopbackSockets {
     async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
         HostSockets.listen(address).await
     }
+
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        HostSockets.datagrams(address, shared).await
+    }
+
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        HostSockets.diagnostics().await
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn the_host_has_datagrams_and_tells_of_its_sockets() {
+        let loopback = || SocketAddr::from(([127, 0, 0, 1], 0));
+        let one = HostSockets.datagrams(loopback(), false).await.unwrap();
+        let two = HostSockets.datagrams(loopback(), false).await.unwrap();
+        let address = two.local_addr().unwrap();
+        one.send_to(b"hello", address).await.unwrap();
+        let mut text = [0; 8];
+        assert_eq!(two.recv(&mut text).await.unwrap(), 5);
+        assert!(HostSockets.datagrams(address, false).await.is_err());
+        assert!(HostSockets.diagnostics().await.unwrap().is_some());
+    }
 
     #[tokio::test]
     async fn a_watched_peer_is_gone_after_a_minute() {

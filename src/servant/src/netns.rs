@@ -11,7 +11,7 @@ use std::sync::{Arc, OnceLock, mpsc};
 use caps::Capability;
 use nix::sched::{CloneFlags, setns, unshare};
 use nix::sys::socket::{SockaddrStorage, bind, setsockopt, sockopt};
-use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::net::{TcpListener, TcpSocket, TcpStream, UdpSocket};
 use tokio::sync::oneshot;
 
 use crate::Error;
@@ -104,6 +104,18 @@ impl NetNs {
         self.socket(address, Some(address)).await?.listen(1024)
     }
 
+    /// A UDP socket bound to `address` as seen from inside; port 0 picks a free one. With `shared` others may be bound to
+    /// it, too, for multicast. What has come and was not read has room for 8 MiB, or for as much as the machine allows.
+    pub async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        let fd = self.open(Kind::Datagrams { shared }, Some(address)).await?;
+        UdpSocket::from_std(std::net::UdpSocket::from(fd))
+    }
+
+    /// A socket by which the kernel tells of the sockets inside (sock_diag(7)).
+    pub async fn diagnostics(&self) -> io::Result<OwnedFd> {
+        self.open(Kind::Diagnostics, None).await
+    }
+
     /// A TCP socket made inside, for addresses of the family of `address`; bound where that is asked for: of ports below
     /// 1024 that takes a capability.
     async fn socket(
@@ -111,28 +123,45 @@ impl NetNs {
         address: SocketAddr,
         bound: Option<SocketAddr>,
     ) -> io::Result<TcpSocket> {
-        let family = if address.is_ipv4() {
-            libc::AF_INET
-        } else {
-            libc::AF_INET6
+        let kind = match address.is_ipv4() {
+            true => Kind::Stream(libc::AF_INET),
+            false => Kind::Stream(libc::AF_INET6),
         };
+        let fd = self.open(kind, bound).await?;
+        Ok(TcpSocket::from_std_stream(std::net::TcpStream::from(fd)))
+    }
+
+    async fn open(&self, kind: Kind, bound: Option<SocketAddr>) -> io::Result<OwnedFd> {
         let (answer, answered) = oneshot::channel();
         let order = Order {
             namespace: self.file.clone(),
-            family,
+            kind,
             bound,
             answer,
         };
         let gone = || io::Error::other("the thread that opens sockets in namespaces has ended");
         opener().send(order).map_err(|_| gone())?;
-        let fd = answered.await.map_err(|_| gone())??;
-        Ok(TcpSocket::from_std_stream(std::net::TcpStream::from(fd)))
+        answered.await.map_err(|_| gone())?
     }
+}
+
+/// What is to be opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    /// TCP, of this family.
+    Stream(i32),
+    /// UDP, of the family of the address that it is bound to.
+    Datagrams {
+        /// Whether others may be bound to it, too.
+        shared: bool,
+    },
+    /// `NETLINK_SOCK_DIAG`.
+    Diagnostics,
 }
 
 struct Order {
     namespace: Arc<OwnedFd>,
-    family: i32,
+    kind: Kind,
     bound: Option<SocketAddr>,
     answer: oneshot::Sender<io::Result<OwnedFd>>,
 }
@@ -147,7 +176,7 @@ fn opener() -> &'static mpsc::Sender<Order> {
             // Where this fails it has more than it needs, as all threads of a program that is not the daemon.
             let _ = privilege::only(&OPENERS);
             for order in orders {
-                let socket = open_socket(order.namespace.as_fd(), order.family, order.bound);
+                let socket = open_socket(order.namespace.as_fd(), order.kind, order.bound);
                 // Nobody waits any more when the asker was cancelled; the socket then closes.
                 let _ = order.answer.send(socket);
             }
@@ -163,25 +192,43 @@ fn opener() -> &'static mpsc::Sender<Order> {
     })
 }
 
-/// What entering a namespace takes, and binding to ports below 1024 there.
-const OPENERS: [Capability; 2] = [Capability::CAP_SYS_ADMIN, Capability::CAP_NET_BIND_SERVICE];
+/// What entering a namespace takes, and binding to ports below 1024 there, and room for more datagrams than everybody is allowed.
+const OPENERS: [Capability; 3] = [
+    Capability::CAP_SYS_ADMIN,
+    Capability::CAP_NET_BIND_SERVICE,
+    Capability::CAP_NET_ADMIN,
+];
+/// For datagrams that have come and were not read yet: pictures come faster than they are read.
+const DATAGRAMS: usize = 8 << 20;
 
 fn open_socket(
     namespace: BorrowedFd<'_>,
-    family: i32,
+    kind: Kind,
     bound: Option<SocketAddr>,
 ) -> io::Result<OwnedFd> {
     setns(namespace, CloneFlags::CLONE_NEWNET)?;
-    let kind = libc::SOCK_STREAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
+    let (family, of, protocol) = match (kind, bound) {
+        (Kind::Stream(family), _) => (family, libc::SOCK_STREAM, 0),
+        (Kind::Datagrams { .. }, Some(SocketAddr::V6(_))) => (libc::AF_INET6, libc::SOCK_DGRAM, 0),
+        (Kind::Datagrams { .. }, _) => (libc::AF_INET, libc::SOCK_DGRAM, 0),
+        (Kind::Diagnostics, _) => (libc::AF_NETLINK, libc::SOCK_RAW, libc::NETLINK_SOCK_DIAG),
+    };
+    let flags = libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
     // SAFETY: no pointers.
-    let fd = unsafe { libc::socket(family, kind, 0) };
+    let fd = unsafe { libc::socket(family, of | flags, protocol) };
     if fd < 0 {
         return Err(io::Error::last_os_error());
     }
     // SAFETY: opened just now, owned by nobody else.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
+    if let Kind::Datagrams { .. } = kind {
+        let forced = setsockopt(&socket, sockopt::RcvBufForce, &DATAGRAMS);
+        forced.or_else(|_| setsockopt(&socket, sockopt::RcvBuf, &DATAGRAMS))?;
+    }
     if let Some(address) = bound {
-        setsockopt(&socket, sockopt::ReuseAddr, &true)?;
+        // Of UDP it lets several sockets have one port.
+        let reuse = !matches!(kind, Kind::Datagrams { shared: false });
+        setsockopt(&socket, sockopt::ReuseAddr, &reuse)?;
         bind(fd, &SockaddrStorage::from(address))?;
     }
     Ok(socket)
@@ -248,6 +295,34 @@ mod tests {
         assert!(
             TcpStream::connect(address).await.is_err(),
             "the host must not see it"
+        );
+    }
+
+    #[tokio::test]
+    async fn datagrams_meet_inside_and_the_kernel_tells_of_them() {
+        let (one, two) = (NetNs::create().unwrap(), NetNs::create().unwrap());
+        let loopback = || SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+        let far = one.datagrams(loopback(), false).await.unwrap();
+        let address = far.local_addr().unwrap();
+        let near = one.datagrams(loopback(), false).await.unwrap();
+        near.send_to(b"hello", address).await.unwrap();
+        let mut text = [0; 8];
+        assert_eq!(far.recv_from(&mut text).await.unwrap().0, 5);
+        assert!(
+            one.datagrams(address, false).await.is_err(),
+            "the port is taken there"
+        );
+        two.datagrams(address, false)
+            .await
+            .expect("it is free elsewhere");
+        one.diagnostics()
+            .await
+            .expect("a socket of the kernel's diagnostics");
+        let room = nix::sys::socket::getsockopt(&far, sockopt::RcvBuf).unwrap();
+        assert_eq!(
+            room,
+            2 * DATAGRAMS,
+            "the kernel counts twice what is asked for"
         );
     }
 
