@@ -102,6 +102,7 @@ impl Topic {
                     offer: None,
                 })
                 .collect(),
+            refused: Vec::new(),
         };
         let tell = |end: &watch::Sender<Matched>, now: Matched| {
             end.send_if_modified(|before| std::mem::replace(before, now.clone()) != now);

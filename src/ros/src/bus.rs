@@ -1,4 +1,4 @@
-//! The seam behind which a ROS version hides: ROS 1 (Master, TCPROS) now, ROS 2 (DDS) next.
+//! The seam behind which a ROS version hides: ROS 1 (Master, TCPROS) or ROS 2 (DDS).
 //!
 //! Messages cross it serialized, reference-counted and never copied per subscriber. What only some ROS versions have is an
 //! extension ([`GlobalParameters`], [`Lending`], [`Hearing`]) that a bus offers, or not.
@@ -28,7 +28,7 @@ pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents
 pub use error::{BusError, CallFate};
 pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
-pub use matched::{Matched, Offer, Peer, PeerId, reaches};
+pub use matched::{Matched, Offer, Peer, PeerId, Refusal, reaches};
 pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
 pub use qos::{Durability, Qos, Reliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};

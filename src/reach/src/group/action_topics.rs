@@ -145,7 +145,10 @@ impl ActionTopics {
             client: GroupClient::new(group, robot, name, of),
             state: Mutex::default(),
             budget: budget.clone(),
-            matched: watch::Sender::new(Matched { peers: vec![peer] }),
+            matched: watch::Sender::new(Matched {
+                peers: vec![peer],
+                refused: Vec::new(),
+            }),
             numbers: Default::default(),
         }))
     }

@@ -83,9 +83,6 @@ pub enum BusError {
     /// This ROS has no such thing.
     #[error("{0} are not offered by this ROS")]
     NotOffered(&'static str),
-    /// There is no bus for it.
-    #[error("ROS {0} cannot be joined: this version speaks ROS 1 only")]
-    NoSuchRos(u8),
     /// The bus was closed.
     #[error("the connection to this ROS system was closed")]
     Closed,

@@ -24,7 +24,7 @@ pub struct Graph {
 /// The ends of one topic.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TopicNodes {
-    /// `package/Type`, or `*` where nobody has said yet.
+    /// `package/Type`, of ROS 2 `package/msg/Type`, or `*` where nobody has said yet.
     pub type_name: String,
     /// Names of publishing nodes.
     pub publishers: Vec<String>,
@@ -35,7 +35,7 @@ pub struct TopicNodes {
 /// The ends of one action.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ActionNodes {
-    /// `package/Name`, or `*` where nobody has said yet.
+    /// `package/Name`, of ROS 2 `package/action/Name`, or `*` where nobody has said yet.
     pub type_name: String,
     /// Names of nodes that serve it.
     pub servers: Vec<String>,

@@ -1,6 +1,8 @@
 //! Who is at the other end of a topic.
 
+use std::cmp::Ordering;
 use std::fmt;
+use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
 use tokio::sync::watch;
@@ -8,7 +10,10 @@ use tokio::sync::watch;
 use super::WireType;
 
 /// Tells publishers, or subscribers, of a topic apart. It is shown as the name of its node.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+///
+/// A number of more than 64 bits (a GUID of DDS) is nobody else's: of such ends it alone is compared, because the name of the
+/// node may become known later than they do.
+#[derive(Debug, Clone)]
 pub struct PeerId {
     node: Arc<str>,
     number: u128,
@@ -24,6 +29,38 @@ impl PeerId {
     /// The name of its node, for a look into the graph and for messages.
     pub fn node(&self) -> &str {
         &self.node
+    }
+
+    /// What is compared.
+    fn key(&self) -> (&str, u128) {
+        let unique = self.number > u128::from(u64::MAX);
+        (if unique { "" } else { &self.node }, self.number)
+    }
+}
+
+impl PartialEq for PeerId {
+    fn eq(&self, other: &Self) -> bool {
+        self.key() == other.key()
+    }
+}
+
+impl Eq for PeerId {}
+
+impl Hash for PeerId {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.key().hash(state);
+    }
+}
+
+impl Ord for PeerId {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.key().cmp(&other.key())
+    }
+}
+
+impl PartialOrd for PeerId {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
     }
 }
 
@@ -60,11 +97,22 @@ pub struct Peer {
     pub offer: Option<Offer>,
 }
 
+/// An end of the same topic with which no messages pass, because both ends mean different things.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refusal {
+    /// The other end.
+    pub peer: PeerId,
+    /// In which they differ, with what the publisher offers and what the subscriber asks for.
+    pub why: String,
+}
+
 /// Who is at the other end, at one moment.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Matched {
     /// In the order in which they came.
     pub peers: Vec<Peer>,
+    /// Ends that could be there, were types and quality of service the same. ROS 1 does not know them.
+    pub refused: Vec<Refusal>,
 }
 
 impl Matched {
@@ -96,4 +144,24 @@ pub async fn reaches(mut matched: watch::Receiver<Matched>, count: usize) {
     let _ = matched
         .wait_for(|matched| matched.connected() >= count)
         .await;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_end_with_a_guid_stays_itself_when_its_node_becomes_known() {
+        let guid = u128::from(u64::MAX) + 1;
+        assert_eq!(
+            PeerId::new("/talker", guid),
+            PeerId::new("01.0f|1.c1", guid)
+        );
+        assert_ne!(
+            PeerId::new("/talker", guid),
+            PeerId::new("/talker", guid + 1)
+        );
+        assert_ne!(PeerId::new("/a", 1), PeerId::new("/b", 1));
+        assert!(PeerId::new("/a", 1) < PeerId::new("/b", 0));
+    }
 }

@@ -112,7 +112,7 @@ impl fmt::Debug for Digest {
 /// The type of a topic's messages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct WireType {
-    /// `package/Type`, or `*` where nobody has said.
+    /// `package/Type`, of ROS 2 `package/msg/Type`, or `*` where nobody has said.
     pub name: String,
     /// How its messages are written.
     pub format: WireFormat,
@@ -162,7 +162,14 @@ impl WireType {
 
     /// What its definition says.
     pub fn schema(&self) -> Result<Arc<MessageType>, SchemaError> {
-        MessageType::of_full_text(self.format.version(), &self.name, &self.definition)
+        let version = self.format.version();
+        let schema = MessageType::of_full_text(version, &self.name, &self.definition)?;
+        // Publishers of ROS 2 do not send it. Nothing is the definition of few types.
+        let is_told = version == RosVersion::One || !self.definition.is_empty();
+        match is_told || self.digest == *schema.digest() {
+            true => Ok(schema),
+            false => Err(SchemaError::Unknown(self.name.clone())),
+        }
     }
 }
 
@@ -176,12 +183,16 @@ impl fmt::Display for WireType {
 /// The type of a service's requests and responses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceType {
-    /// `package/Type`.
+    /// `package/Type`, of ROS 2 `package/srv/Type`.
     pub name: String,
     /// How its messages are written.
     pub format: WireFormat,
     /// Of request and response together.
     pub digest: Digest,
+    /// Of its requests alone, where ends tell that of each other (ROS 2); else `*`.
+    pub request: Digest,
+    /// Of its responses alone, likewise.
+    pub response: Digest,
 }
 
 impl ServiceType {
@@ -191,14 +202,63 @@ impl ServiceType {
             name: name.into(),
             format: WireFormat::Ros1,
             digest: digest.into(),
+            request: Digest::any(),
+            response: Digest::any(),
         }
     }
 
     /// A type whose definition is known.
     pub fn of(service: &ServiceDef) -> Self {
+        let of = |message: &MessageType| match message.version() {
+            RosVersion::One => Digest::any(),
+            RosVersion::Two => Digest::from(message.digest()),
+        };
         Self {
             format: WireFormat::of(service.request.version()),
+            request: of(&service.request),
+            response: of(&service.response),
             ..Self::new(&*service.name, &*service.md5)
         }
+    }
+
+    /// Whether who expects one understands a server of the other.
+    pub fn agrees(&self, other: &ServiceType) -> bool {
+        self.digest.agrees(&other.digest)
+            && self.request.agrees(&other.request)
+            && self.response.agrees(&other.response)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_type_of_ros_2_that_tells_no_definition_has_none() {
+        let of = |text: &str| {
+            let found = MessageType::of_full_text(RosVersion::Two, "a/msg/B", text);
+            WireType::of(&found.expect("a definition"))
+        };
+        let (string, empty) = (of("string data"), of(""));
+        assert!(string.schema().is_ok() && empty.schema().is_ok());
+        let untold = WireType {
+            definition: String::new(),
+            ..string
+        };
+        assert_eq!(
+            untold.schema().err(),
+            Some(SchemaError::Unknown("a/msg/B".to_owned()))
+        );
+    }
+
+    #[test]
+    fn services_agree_by_what_is_known_of_them() {
+        let known = |request: &str| ServiceType {
+            request: Digest::from(request),
+            ..ServiceType::new("a/srv/B", "*")
+        };
+        assert!(known("x").agrees(&known("x")) && known("x").agrees(&known("*")));
+        assert!(!known("x").agrees(&known("y")));
+        assert!(!ServiceType::new("a/B", "x").agrees(&ServiceType::new("a/B", "y")));
     }
 }

@@ -274,6 +274,7 @@ impl State {
         });
         Matched {
             peers: peers.collect(),
+            refused: Vec::new(),
         }
     }
 }

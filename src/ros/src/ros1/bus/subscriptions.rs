@@ -269,6 +269,7 @@ impl TopicIn {
         });
         let now = Matched {
             peers: peers.collect(),
+            refused: Vec::new(),
         };
         self.matched.send_if_modified(|before| {
             let news = *before != now;
