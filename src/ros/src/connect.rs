@@ -6,6 +6,7 @@ use crate::JoinOptions;
 use crate::bus::{Bus, BusError, RosVersion};
 use crate::net::Sockets;
 use crate::ros1::Ros1Bus;
+use crate::ros2::Ros2Bus;
 
 /// Joins a ROS system of this version.
 pub async fn connect(
@@ -15,6 +16,6 @@ pub async fn connect(
 ) -> Result<Arc<dyn Bus>, BusError> {
     match version {
         RosVersion::One => Ok(Ros1Bus::connect_with(sockets, options).await?),
-        RosVersion::Two => Err(BusError::NoSuchRos(version.number())),
+        RosVersion::Two => Ok(Ros2Bus::connect(sockets, options).await?),
     }
 }

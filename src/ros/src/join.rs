@@ -15,6 +15,10 @@ pub const UNFINISHED: Duration = Duration::from_secs(300);
 pub struct JoinOptions {
     /// Where the Master listens, as seen from the sockets' place (ROS 1).
     pub master: SocketAddr,
+    /// `ROS_DOMAIN_ID` (ROS 2): 0 to 232.
+    pub domain: u16,
+    /// What `$ROS_DISTRO` stands for (ROS 2, which does not tell it); may be empty.
+    pub distribution: String,
     /// The node's absolute name.
     pub node: String,
     /// The host that other nodes reach this one under; the address used towards the Master where `None`.
@@ -28,15 +32,25 @@ pub struct JoinOptions {
 }
 
 impl JoinOptions {
-    /// A node of this name at this Master.
+    /// A node of this name at this Master (ROS 1), in domain 0 (ROS 2).
     pub fn new(master: SocketAddr, node: &str) -> Self {
         Self {
             master,
+            domain: 0,
+            distribution: String::new(),
             node: node.to_owned(),
             host: None,
             max_message: MAX_MESSAGE,
             budget: Budget::unlimited(),
             unfinished: UNFINISHED,
+        }
+    }
+
+    /// A node of this name in this domain (ROS 2).
+    pub fn in_domain(domain: u16, node: &str) -> Self {
+        Self {
+            domain,
+            ..Self::new(SocketAddr::from(([0, 0, 0, 0], 0)), node)
         }
     }
 }

@@ -15,6 +15,7 @@ mod join;
 pub mod net;
 pub mod ring;
 pub mod ros1;
+pub mod ros2;
 pub mod schema;
 pub mod sizes;
 pub mod turns;

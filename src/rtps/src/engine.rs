@@ -235,6 +235,17 @@ impl Engine {
         }
     }
 
+    /// Whether readers have all that was written to them.
+    pub fn is_settled(&self) -> bool {
+        let mut written = self
+            .writers
+            .iter()
+            .filter(|(entity, _)| !entity.is_builtin());
+        written.all(|(entity, writer)| {
+            writer.state.is_settled() && !self.paths.values().any(|path| path.holds(*entity))
+        })
+    }
+
     /// Tells whoever waits, after something was changed from outside.
     pub fn settle(&mut self) {
         self.tell();

@@ -286,12 +286,22 @@ impl Participant {
         });
     }
 
+    /// Returns once readers have all that was written to them.
+    pub async fn settled(&self) {
+        while !self.running.shared.look(Engine::is_settled) {
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
     /// Says good-bye. Ends that are still held become inert.
     pub async fn close(&self) {
         self.running.shared.with(|_, engine| engine.close());
         self.running.task.abort();
     }
 }
+
+/// How often it is looked whether all has come, where somebody waits for that.
+const LOOK: Duration = Duration::from_millis(5);
 
 /// Without a look at the ports that are bound, participants with these numbers are told of us, bound or not.
 const UNSEEN: u16 = 16;

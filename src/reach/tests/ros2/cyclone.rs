@@ -1,0 +1,66 @@
+//! An implementation of DDS by others than Fast DDS, whose services have headers of their own.
+
+use std::sync::Arc;
+
+use ros::bus::{Bus, Qos, reaches};
+use serde_json::json as value;
+use tokio::time::timeout;
+
+use super::lab::{LONG, Lab, Peer, json, of_set_bool, of_string, said, set_bool, shows, string};
+use super::services::{Answers, request};
+
+const NODE: &str = "/cloudroid_bridge";
+const SCRIPT: &str = "cyclone.py";
+
+async fn peer(lab: &Lab) -> Peer {
+    lab.node(SCRIPT, &[]).await
+}
+
+#[tokio::test]
+async fn messages_go_there_and_back() {
+    let lab = Lab::new();
+    let _peer = peer(&lab).await;
+    let bus = lab.join(NODE).await;
+    let qos = Qos::keep_last(10);
+    let mut pong = bus.subscribe("/pong", of_string(), qos).await.unwrap();
+    let ping = bus.advertise("/ping", of_string(), qos).await.unwrap();
+    for matched in [ping.matched(), pong.matched.clone()] {
+        timeout(LONG, reaches(matched, 1)).await.expect("somebody");
+    }
+    for number in 0..10 {
+        ping.publish(said(&number.to_string()));
+        let message = timeout(LONG, pong.messages.recv()).await;
+        let message = message.expect("a message").expect("the bus is open");
+        let expected = format!(r#"{{"data":"{number}"}}"#);
+        assert_eq!(json(&string(), &message.bytes), expected);
+    }
+}
+
+#[tokio::test]
+async fn its_services_are_called() {
+    let lab = Lab::new();
+    let _peer = peer(&lab).await;
+    let bus = lab.join(NODE).await;
+    shows(&bus, |graph| graph.services.contains_key("/set")).await;
+    for data in [true, false] {
+        let answer = bus.call("/set", request(data), LONG).await.unwrap();
+        let expected = format!(r#"{{"success":{data},"message":"set"}}"#);
+        assert_eq!(json(&set_bool().response, &answer), expected);
+    }
+}
+
+#[tokio::test]
+async fn it_is_answered() {
+    let lab = Lab::new();
+    let mut peer = peer(&lab).await;
+    let bus = lab.join(NODE).await;
+    let served = bus.serve("/ask", of_set_bool(), Arc::new(Answers)).await;
+    let _served = served.unwrap();
+    for (number, data) in [true, false].into_iter().enumerate() {
+        let answer = peer.obey(&format!("call {data}")).await;
+        // It has no nodes: what asks is a participant.
+        assert_eq!(answer[..2], [value!(number), value!(data)]);
+        let caller = answer[2].as_str().expect("a caller");
+        assert!(caller.starts_with("01.10."), "{caller}");
+    }
+}

@@ -1,0 +1,33 @@
+//! ROS 2: the bus over DDS, by the crate `rtps`.
+
+mod actions;
+mod bus;
+mod calls;
+mod client;
+mod ends;
+mod entities;
+mod graph;
+mod interfaces;
+pub mod lifecycle;
+pub mod names;
+mod parameters;
+mod place;
+pub mod process;
+mod publications;
+mod quality;
+mod raw;
+mod replies;
+mod request_header;
+mod seen;
+mod services;
+mod show;
+mod subscriptions;
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
+mod topic_type;
+mod type_hash;
+mod watcher;
+
+pub use bus::Ros2Bus;

@@ -1,0 +1,294 @@
+//! The graph of ROS out of what is seen in DDS: topics, services and actions with the nodes at their ends.
+
+use std::collections::BTreeMap;
+
+use rtps::Guid;
+
+use super::ends::OwnEnds;
+use super::names::{self, Named};
+use super::seen::Seen;
+use crate::bus::{ActionNodes, Graph, TopicNodes};
+
+/// One end, whoever has it.
+struct End<'a> {
+    topic: &'a str,
+    type_name: &'a str,
+    node: String,
+    writes: bool,
+}
+
+/// The graph of all nodes; `own` are the ends of the node of this name and participant. Names that begin with `_` somewhere are
+/// left out, and so are ends of whose node nothing is known yet.
+pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid)) -> Graph {
+    let mut building = Building::default();
+    for end in ends(seen, own, node) {
+        building.add(&end);
+    }
+    let mut graph = building.graph;
+    let served = &graph.services;
+    let sought = building.sought.into_iter();
+    graph.sought = sought
+        .filter(|(service, _)| !served.contains_key(service))
+        .collect();
+    let nodes = seen
+        .nodes
+        .iter()
+        .map(|(name, participant)| (&**name, *participant));
+    let nodes = nodes.chain([(node, participant)]);
+    let shown = nodes.filter(|(name, _)| !names::is_hidden(name));
+    graph.nodes = shown
+        .map(|(name, participant)| (name.to_owned(), participant.to_string()))
+        .collect();
+    graph
+}
+
+/// Writers first: it is they who say what a topic's type is.
+fn ends<'a>(seen: &'a Seen, own: &'a OwnEnds, node: &'a str) -> Vec<End<'a>> {
+    let (writers, readers) = (
+        seen.discovered.writers.values(),
+        seen.discovered.readers.values(),
+    );
+    let sides = [(true, &own.writers), (false, &own.readers)];
+    let theirs = writers
+        .map(|end| (true, end))
+        .chain(readers.map(|end| (false, end)));
+    let named = theirs.filter(|(_, end)| seen.is_named(end.guid));
+    let theirs = named.map(|(writes, end)| End {
+        topic: &end.topic,
+        type_name: &end.type_name,
+        node: seen.node(end.guid).to_string(),
+        writes,
+    });
+    let ours = sides.into_iter().flat_map(move |(writes, ends)| {
+        ends.values().map(move |end| End {
+            topic: &end.topic,
+            type_name: &end.type_name,
+            node: node.to_owned(),
+            writes,
+        })
+    });
+    let mut all: Vec<End<'a>> = theirs.chain(ours).collect();
+    all.sort_by_key(|end| !end.writes);
+    all
+}
+
+#[derive(Default)]
+struct Building {
+    graph: Graph,
+    /// Services that nodes have clients of.
+    sought: BTreeMap<String, Vec<String>>,
+}
+
+impl Building {
+    fn add(&mut self, end: &End<'_>) {
+        match names::named(end.topic) {
+            Some(Named::Topic(name)) if !names::is_hidden(&name) => self.topic(name, end),
+            Some(Named::Request(name)) => match names::action_part(&name) {
+                Some((action, "send_goal")) => self.action(action, end),
+                _ if !names::is_hidden(&name) => self.service(name, end),
+                _ => {}
+            },
+            // Servers and clients are known by the requests.
+            _ => {}
+        }
+    }
+
+    fn topic(&mut self, name: String, end: &End<'_>) {
+        let topic = self.graph.topics.entry(name).or_insert_with(|| TopicNodes {
+            type_name: names::type_of(end.type_name),
+            ..TopicNodes::default()
+        });
+        let nodes = match end.writes {
+            true => &mut topic.publishers,
+            false => &mut topic.subscribers,
+        };
+        add(nodes, &end.node);
+    }
+
+    fn service(&mut self, name: String, end: &End<'_>) {
+        if end.writes {
+            add(self.sought.entry(name).or_default(), &end.node);
+        } else {
+            let server = self.graph.services.entry(name);
+            server.or_insert_with(|| end.node.clone());
+        }
+    }
+
+    fn action(&mut self, name: &str, end: &End<'_>) {
+        let type_name = names::action_type_of(end.type_name);
+        let action = self.graph.actions.entry(name.to_owned());
+        let action = action.or_insert_with(|| ActionNodes {
+            type_name: type_name.unwrap_or_else(|| "*".to_owned()),
+            ..ActionNodes::default()
+        });
+        let nodes = match end.writes {
+            true => &mut action.clients,
+            false => &mut action.servers,
+        };
+        add(nodes, &end.node);
+    }
+}
+
+/// A node may have several ends of one topic.
+fn add(nodes: &mut Vec<String>, node: &str) {
+    if !nodes.iter().any(|known| known == node) {
+        nodes.push(node.to_owned());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+    use std::sync::Arc;
+
+    use bytes::Bytes;
+    use rtps::{
+        Discovered, EndpointData, EndpointQos, EntityId, GuidPrefix, ParticipantData, VendorId,
+    };
+
+    use super::super::ends::OwnEnd;
+    use super::super::entities::{Entities, GidSize, Node};
+    use super::*;
+
+    /// An end with this number in the participant with this number.
+    fn guid(participant: u8, end: u8, writes: bool) -> Guid {
+        let kind = if writes { 3 } else { 4 };
+        Guid::new(GuidPrefix([participant; 12]), EntityId([0, 0, end, kind]))
+    }
+
+    fn participant(number: u8, user_data: &'static [u8]) -> Arc<ParticipantData> {
+        Arc::new(ParticipantData {
+            prefix: GuidPrefix([number; 12]),
+            vendor: VendorId::FAST_DDS,
+            version: [2, 3],
+            domain: None,
+            name: String::new(),
+            user_data: Bytes::from_static(user_data),
+            discovery: Vec::new(),
+            user: Vec::new(),
+            builtin: 0,
+            lease: None,
+        })
+    }
+
+    fn endpoint(guid: Guid, topic: &str, type_name: &str) -> Arc<EndpointData> {
+        Arc::new(EndpointData {
+            guid,
+            topic: topic.to_owned(),
+            type_name: type_name.to_owned(),
+            qos: EndpointQos::default(),
+            user_data: Bytes::new(),
+            unicast: Vec::new(),
+            expects_inline_qos: false,
+        })
+    }
+
+    const STRING: &str = "std_msgs::msg::dds_::String_";
+    const SET_BOOL: &str = "std_srvs::srv::dds_::SetBool_Request_";
+    const SEND_GOAL: &str = "test_msgs::action::dds_::Fibonacci_SendGoal_Request_";
+
+    /// Participant 1 is of ROS, with a node that serves; participant 2 is not.
+    fn seen(owned: &[Guid], ends: Vec<Arc<EndpointData>>) -> Seen {
+        let mut discovered = Discovered::default();
+        for told in [participant(1, b"enclave=/;"), participant(2, b"")] {
+            discovered.participants.insert(told.prefix, told);
+        }
+        for end in ends {
+            let known = match end.guid.entity.is_writer() {
+                true => &mut discovered.writers,
+                false => &mut discovered.readers,
+            };
+            known.insert(end.guid, end);
+        }
+        let (writers, readers) = owned
+            .iter()
+            .copied()
+            .partition(|end: &Guid| end.entity.is_writer());
+        let node = |name: &str, readers, writers| Node {
+            name: name.into(),
+            readers,
+            writers,
+        };
+        let entities = Entities {
+            nodes: vec![
+                node("/server", readers, writers),
+                node("/_ros2cli_1", Vec::new(), Vec::new()),
+            ],
+            gids: GidSize::Sixteen,
+        };
+        let told = HashMap::from([(GuidPrefix([1; 12]), Arc::new(entities))]);
+        Seen::new(Arc::new(discovered), &told)
+    }
+
+    #[test]
+    fn topics_services_and_actions_are_what_ends_are_named_after() {
+        let owned = [
+            guid(1, 1, true),
+            guid(1, 2, false),
+            guid(1, 3, false),
+            guid(1, 4, true),
+            guid(1, 5, true),
+        ];
+        let seen = seen(
+            &owned,
+            vec![
+                endpoint(owned[0], "rt/chatter", STRING),
+                endpoint(owned[1], "rq/set_boolRequest", SET_BOOL),
+                endpoint(owned[2], "rq/fib/_action/send_goalRequest", SEND_GOAL),
+                endpoint(owned[3], "rt/fib/_action/feedback", "x"),
+                endpoint(owned[4], "rq/neededRequest", SET_BOOL),
+                // Not told of yet.
+                endpoint(guid(1, 9, true), "rt/early", STRING),
+                endpoint(guid(2, 1, false), "rt/chatter", "Other::Type"),
+                endpoint(guid(2, 2, true), "rt/_hidden", STRING),
+                endpoint(guid(2, 3, true), "not_ros", STRING),
+            ],
+        );
+        let mut own = OwnEnds::default();
+        let asked = OwnEnd {
+            topic: "rq/set_boolRequest".to_owned(),
+            type_name: SET_BOOL.to_owned(),
+        };
+        own.writers.insert(guid(3, 1, true), asked);
+        let sends = OwnEnd {
+            topic: "rq/fib/_action/send_goalRequest".to_owned(),
+            type_name: SEND_GOAL.to_owned(),
+        };
+        own.writers.insert(guid(3, 2, true), sends);
+        let us = Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT);
+        let graph = build(&seen, &own, ("/us", us));
+
+        let server = || vec!["/server".to_owned()];
+        let stranger = Guid::new(GuidPrefix([2; 12]), EntityId::PARTICIPANT).to_string();
+        let chatter = TopicNodes {
+            type_name: "std_msgs/msg/String".to_owned(),
+            publishers: server(),
+            subscribers: vec![stranger],
+        };
+        assert_eq!(graph.topics, [("/chatter".to_owned(), chatter)].into());
+        assert_eq!(
+            graph.services,
+            [("/set_bool".to_owned(), "/server".to_owned())].into()
+        );
+        assert_eq!(graph.sought, [("/needed".to_owned(), server())].into());
+        let fib = ActionNodes {
+            type_name: "test_msgs/action/Fibonacci".to_owned(),
+            servers: server(),
+            clients: vec!["/us".to_owned()],
+            topics: Vec::new(),
+        };
+        assert_eq!(graph.actions, [("/fib".to_owned(), fib)].into());
+        let nodes: Vec<&str> = graph.nodes.keys().map(String::as_str).collect();
+        assert_eq!(nodes, ["/server", "/us"]);
+        assert_eq!(graph.nodes["/us"], us.to_string());
+    }
+
+    #[test]
+    fn nobody_tells_of_the_ends_of_others() {
+        let theirs = guid(2, 1, true);
+        let seen = seen(&[theirs], vec![endpoint(theirs, "rt/chatter", STRING)]);
+        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(3, 0, true)));
+        let stranger = Guid::new(GuidPrefix([2; 12]), EntityId::PARTICIPANT).to_string();
+        assert_eq!(graph.topics["/chatter"].publishers, [stranger]);
+    }
+}

@@ -1,0 +1,126 @@
+//! Follows what is discovered and what participants tell of their nodes, shows the graph, and tells the others what this node
+//! has.
+
+use std::collections::HashMap;
+use std::future::pending;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rtps::Guid;
+use tokio::time::sleep_until;
+
+use super::bus::Inner;
+use super::entities::{self, GidSize, Node};
+use super::seen::Seen;
+use super::{calls, graph};
+
+/// A participant of ROS has so long to tell whose an end is. Until then what it sends is kept, and it is not shown.
+const PATIENCE: Duration = Duration::from_millis(500);
+
+/// Follows one bus's graph.
+pub(super) struct Watcher {
+    bus: Arc<Inner>,
+    /// Tells of this node.
+    teller: rtps::Writer,
+    /// What was told last.
+    told: Option<(Node, GidSize)>,
+    /// Ends of nobody yet, and since when.
+    unnamed: HashMap<Guid, Instant>,
+    /// When the next of them will be late.
+    late_at: Option<Instant>,
+}
+
+impl Watcher {
+    /// With the writer by which it tells of this node.
+    pub(super) fn new(bus: Arc<Inner>, teller: rtps::Writer) -> Self {
+        Self {
+            bus,
+            teller,
+            told: None,
+            unnamed: HashMap::new(),
+            late_at: None,
+        }
+    }
+
+    /// Follows for ever.
+    pub(super) async fn run(mut self) {
+        let mut discovered = self.bus.participant.discovered();
+        let mut told = self.bus.told.changes();
+        let mut own = self.bus.own.changes();
+        loop {
+            discovered.mark_unchanged();
+            told.mark_unchanged();
+            own.mark_unchanged();
+            self.look();
+            let late = self.late_at;
+            let late = async {
+                match late {
+                    Some(late) => sleep_until(late.into()).await,
+                    None => pending().await,
+                }
+            };
+            let changed = tokio::select! {
+                () = late => continue,
+                changed = discovered.changed() => changed,
+                changed = told.changed() => changed,
+                changed = own.changed() => changed,
+            };
+            if changed.is_err() {
+                return;
+            }
+        }
+    }
+
+    /// Shows what is there now.
+    pub(super) fn look(&mut self) {
+        let bus = &self.bus;
+        let (discovered, told) = bus.told.of(&bus.participant.discovered());
+        let mut seen = Seen::new(discovered, &told);
+        self.wait_for_names(&mut seen);
+        let seen = Arc::new(seen);
+        let bus = &self.bus;
+        let own = bus.own.ends();
+        self.tell(&own.node(&self.bus.node), seen.gids);
+        let bus = &self.bus;
+        let mut now = graph::build(&seen, &own, (bus.node.as_str(), bus.participant.guid()));
+        bus.seen.send_replace(Arc::clone(&seen));
+        calls::forget_unserved(bus, &seen);
+        bus.graph.send_if_modified(|before| {
+            now.generation = before.generation;
+            let news = **before != now;
+            if news {
+                now.generation += 1;
+                *before = Arc::new(now);
+            }
+            news
+        });
+    }
+
+    /// Ends that were not named in time are late from then on.
+    fn wait_for_names(&mut self, seen: &mut Seen) {
+        let now = Instant::now();
+        let mut unnamed = HashMap::new();
+        for end in seen.unnamed() {
+            unnamed.insert(end, self.unnamed.get(&end).copied().unwrap_or(now));
+        }
+        let due = unnamed.iter().map(|(end, since)| (*end, *since + PATIENCE));
+        let (late, waited_for): (Vec<_>, Vec<_>) = due.partition(|(_, due)| *due <= now);
+        seen.late = late.into_iter().map(|(end, _)| end).collect();
+        self.late_at = waited_for.into_iter().map(|(_, due)| due).min();
+        self.unnamed = unnamed;
+    }
+
+    fn tell(&mut self, node: &Node, size: GidSize) {
+        let news = self
+            .told
+            .as_ref()
+            .is_none_or(|(before, with)| before != node || *with != size);
+        if news {
+            let participant = self.bus.participant.guid();
+            let nodes = std::slice::from_ref(node);
+            self.teller
+                .write(entities::encode(participant, nodes, size));
+            self.told = Some((node.clone(), size));
+        }
+    }
+}
