@@ -367,14 +367,18 @@ enum Made {
 fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
     let mut environment = built.environment.clone();
     environment.extend(built.flavour.environment(HOME_INSIDE));
+    let mut nodes: Vec<_> = built
+        .plan
+        .nodes
+        .iter()
+        .map(|node| node.spec(HOME_INSIDE))
+        .collect();
+    for node in &mut nodes {
+        naming::tell_parameters(&built.flavour, node, &built.plan.parameters);
+    }
     Plan {
         environment,
-        nodes: built
-            .plan
-            .nodes
-            .iter()
-            .map(|node| node.spec(HOME_INSIDE))
-            .collect(),
+        nodes,
         parameters: built.plan.parameters.clone(),
         limits: options.limits,
         caps: options.caps,

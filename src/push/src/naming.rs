@@ -4,7 +4,7 @@
 //! node in a namespace of its own to tell it by, and ended as soon as it has registered. From then on it is told that
 //! name: one with a random end (an anonymous node's) would be another each time.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -13,9 +13,10 @@ use package::interface::Interface;
 use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
-use ros::bus::{Graph, RosVersion};
+use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use servant::engine::Servant;
+use servant::spec::NodeSpec;
 use tokio::time::timeout;
 
 use super::Pusher;
@@ -51,7 +52,8 @@ pub(super) async fn settle(
         .map(|index| {
             let mut node = plan.nodes[*index].clone();
             let put = built.flavour.namespace(&namespace(*index));
-            node.environment.extend([put]);
+            node.argv.extend(put.arguments);
+            node.environment.extend(put.environment);
             node
         })
         .collect();
@@ -213,9 +215,26 @@ fn apply(
         }
         let node = &mut plan.nodes[*index];
         let identity = flavour.identity(&name);
-        node.argv.push(identity.argument);
-        node.environment.extend([identity.environment]);
         node.name = name;
+        tell_parameters(flavour, node, &plan.parameters);
+        node.argv.extend(identity.arguments);
+        node.environment.extend(identity.environment);
+    }
+}
+
+/// Tells a node its parameters, where nodes hold their own; not again what it was told before (a node of an exported service).
+pub(super) fn tell_parameters(
+    flavour: &Flavour,
+    node: &mut NodeSpec,
+    all: &BTreeMap<String, ParamValue>,
+) {
+    let arguments = flavour.arguments(&node.name, all);
+    let told = |argv: &[String]| {
+        argv.windows(arguments.len().max(1))
+            .any(|part| part == arguments)
+    };
+    if !arguments.is_empty() && !told(&node.argv) {
+        node.argv.extend(arguments);
     }
 }
 
@@ -249,7 +268,6 @@ pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) 
 mod tests {
     use super::*;
     use package::interface::Parameter;
-    use servant::spec::NodeSpec;
 
     fn plan(names: &[&str]) -> Plan {
         let node = |name: &&str| NodeSpec {
@@ -282,8 +300,7 @@ mod tests {
         let mut plan = plan(&["/costmap_2d_node", "/other", "/third"]);
         let options = given(&["~rate", "/costmap_2d_node/stays"]);
         for key in ["/costmap_2d_node/rate", "/costmap_2d_node/stays"] {
-            plan.parameters
-                .insert(key.to_owned(), ros::bus::ParamValue::Int(1));
+            plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
         }
         let found = [(0, "costmap_2d".to_owned()), (2, "other".to_owned())];
         apply(&mut plan, &Flavour::default(), &[0, 2], &found, &options);

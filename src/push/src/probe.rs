@@ -153,7 +153,7 @@ async fn look(
         next: None,
         log: Vec::new(),
     };
-    let registry = Registry::from_definitions(&built.inventory.definitions)
+    let registry = Registry::of_definitions(built.flavour.ros.bus(), &built.inventory.definitions)
         .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
     let working = Arc::clone(servant);
     let options = ProbeOptions {

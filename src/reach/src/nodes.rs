@@ -113,18 +113,21 @@ impl Nodes for LinkedNodes {
         let program = program(&self.recorded, node)?;
         self.end_planned(&*tenant).await;
         let identity = self.recorded.flavour.identity(&node.name);
+        let mut given = self.recorded.parameters.clone();
+        given.extend(self.parameters(node));
         let mut argv = vec![program.clone()];
+        argv.extend(self.recorded.flavour.arguments(&node.name, &given));
         argv.extend(
             node.argv
                 .iter()
                 .map(|argument| self.translate(node, argument)),
         );
-        argv.push(identity.argument);
+        argv.extend(identity.arguments);
         let directory = self.directory(node, program);
         let spec = NodeSpec {
             name: node.name.clone(),
             argv,
-            environment: [identity.environment].into(),
+            environment: identity.environment,
             directory,
             respawn: false,
             respawn_delay: 0.0,

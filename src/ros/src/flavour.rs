@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::bus::{ParamValue, RosVersion};
 pub use crate::identity::Identity;
-use crate::ros1::process;
+use crate::{ros1, ros2};
 
 /// The base that an image is built upon, and its ROS.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,7 +16,7 @@ pub struct Flavour {
     pub base: String,
     /// Which ROS its packages speak.
     pub ros: Version,
-    /// What `$ROS_DISTRO` stands for: `noetic`.
+    /// What `$ROS_DISTRO` stands for: `noetic`, `jazzy`.
     pub distribution: String,
 }
 
@@ -26,6 +26,8 @@ pub struct Flavour {
 pub enum Version {
     /// Master, TCPROS, catkin.
     Ros1,
+    /// DDS, ament.
+    Ros2,
 }
 
 impl Version {
@@ -33,6 +35,7 @@ impl Version {
     pub fn bus(self) -> RosVersion {
         match self {
             Version::Ros1 => RosVersion::One,
+            Version::Ros2 => RosVersion::Two,
         }
     }
 }
@@ -52,14 +55,16 @@ impl Flavour {
     /// Environment of every process of a servant, over the image's own. `home`: where nodes run and keep what they write.
     pub fn environment(&self, home: &str) -> BTreeMap<String, String> {
         match self.ros {
-            Version::Ros1 => process::environment(home),
+            Version::Ros1 => ros1::process::environment(home),
+            Version::Ros2 => ros2::process::environment(home),
         }
     }
 
     /// Where nodes run that are not told where, in this environment; empty where it does not say.
     pub fn home<'a>(&self, environment: &'a BTreeMap<String, String>) -> &'a str {
         let variable = match self.ros {
-            Version::Ros1 => process::HOME,
+            Version::Ros1 => ros1::process::HOME,
+            Version::Ros2 => ros2::process::HOME,
         };
         environment.get(variable).map_or("", String::as_str)
     }
@@ -67,21 +72,33 @@ impl Flavour {
     /// What makes a program the node of this absolute name.
     pub fn identity(&self, node: &str) -> Identity {
         match self.ros {
-            Version::Ros1 => process::identity(node),
+            Version::Ros1 => ros1::process::identity(node),
+            Version::Ros2 => ros2::process::identity(node),
         }
     }
 
-    /// What puts a program that chooses its name itself into a namespace: a variable.
-    pub fn namespace(&self, namespace: &str) -> (String, String) {
+    /// What puts a program that chooses its name itself into a namespace.
+    pub fn namespace(&self, namespace: &str) -> Identity {
         match self.ros {
-            Version::Ros1 => process::namespace(namespace),
+            Version::Ros1 => ros1::process::namespace(namespace),
+            Version::Ros2 => ros2::process::namespace(namespace),
+        }
+    }
+
+    /// Arguments that give the node of this absolute name its parameters, where nodes hold their own (ROS 2); more of them may
+    /// follow, and the last one of a name counts. `all`: absolute names.
+    pub fn arguments(&self, node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<String> {
+        match self.ros {
+            Version::Ros1 => Vec::new(),
+            Version::Ros2 => ros2::process::parameters(node, all),
         }
     }
 
     /// Parameters set before the first node starts: those of the deployer, and those that ROS itself sets.
     pub fn parameters(&self, given: &BTreeMap<String, ParamValue>) -> BTreeMap<String, ParamValue> {
         let mut parameters = match self.ros {
-            Version::Ros1 => process::parameters(&self.distribution),
+            Version::Ros1 => ros1::process::parameters(&self.distribution),
+            Version::Ros2 => BTreeMap::new(),
         };
         parameters.extend(given.clone());
         parameters
@@ -94,19 +111,39 @@ mod tests {
 
     #[test]
     fn a_flavour_is_read_as_it_was_written() {
-        let written = r#"{"base":"lab","ros":"ros1","distribution":"melodic"}"#;
-        let flavour: Flavour = serde_json::from_str(written).expect("a flavour");
+        for (written, ros) in [
+            (
+                r#"{"base":"lab","ros":"ros1","distribution":"melodic"}"#,
+                RosVersion::One,
+            ),
+            (
+                r#"{"base":"lab","ros":"ros2","distribution":"jazzy"}"#,
+                RosVersion::Two,
+            ),
+        ] {
+            let flavour: Flavour = serde_json::from_str(written).expect("a flavour");
+            assert_eq!((&*flavour.base, flavour.ros.bus()), ("lab", ros));
+            assert_eq!(serde_json::to_string(&flavour).expect("JSON"), written);
+        }
+    }
+
+    #[test]
+    fn parameters_are_given_to_the_master_or_to_each_node() {
+        let given = BTreeMap::from([("/see/rate".to_owned(), ParamValue::Int(10))]);
+        let one = Flavour::default();
+        let all = one.parameters(&given);
+        assert_eq!(all["/see/rate"], ParamValue::Int(10));
+        assert_eq!(all["/rosdistro"], ParamValue::String("noetic\n".to_owned()));
+        assert!(one.arguments("/see", &all).is_empty());
+        let two = Flavour {
+            ros: Version::Ros2,
+            ..Flavour::default()
+        };
+        let all = two.parameters(&given);
+        assert_eq!(all, given);
         assert_eq!(
-            (&*flavour.base, flavour.ros.bus()),
-            ("lab", RosVersion::One)
-        );
-        assert_eq!(serde_json::to_string(&flavour).expect("JSON"), written);
-        let given = BTreeMap::from([("/rate".to_owned(), ParamValue::Int(10))]);
-        let parameters = flavour.parameters(&given);
-        assert_eq!(parameters["/rate"], ParamValue::Int(10));
-        assert_eq!(
-            parameters["/rosdistro"],
-            ParamValue::String("melodic\n".to_owned())
+            two.arguments("/see", &all),
+            ["--ros-args", "-p", "rate:=10", "--"]
         );
     }
 }

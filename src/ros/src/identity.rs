@@ -1,10 +1,12 @@
 //! Which node a program is, as its version of ROS is told.
 
-/// What tells a program which node it is.
-#[derive(Debug, Clone, PartialEq, Eq)]
+use std::collections::BTreeMap;
+
+/// What tells a program which node it is, or in which namespace.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Identity {
-    /// To be added to its command line.
-    pub argument: String,
+    /// To be added at the end of its command line.
+    pub arguments: Vec<String>,
     /// To be added to its environment.
-    pub environment: (String, String),
+    pub environment: BTreeMap<String, String>,
 }

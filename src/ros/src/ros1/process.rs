@@ -31,14 +31,17 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
 pub(crate) fn identity(node: &str) -> Identity {
     let (above, last) = node.rsplit_once('/').unwrap_or(("", node));
     Identity {
-        argument: format!("__name:={last}"),
-        environment: namespace(above),
+        arguments: vec![format!("__name:={last}")],
+        ..namespace(above)
     }
 }
 
-pub(crate) fn namespace(namespace: &str) -> (String, String) {
+pub(crate) fn namespace(namespace: &str) -> Identity {
     let namespace = if namespace.is_empty() { "/" } else { namespace };
-    ("ROS_NAMESPACE".to_owned(), namespace.to_owned())
+    Identity {
+        arguments: Vec::new(),
+        environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
+    }
 }
 
 /// What roslaunch sets. The line end is its own: it fills the parameter from the output of a command.
@@ -60,9 +63,9 @@ mod tests {
             ("/a/b/c", "__name:=c", "/a/b"),
         ] {
             let identity = identity(node);
-            assert_eq!(identity.argument, argument, "{node}");
+            assert_eq!(identity.arguments, [argument], "{node}");
             let variable = ("ROS_NAMESPACE".to_owned(), namespace.to_owned());
-            assert_eq!(identity.environment, variable, "{node}");
+            assert_eq!(identity.environment, [variable].into(), "{node}");
         }
     }
 
