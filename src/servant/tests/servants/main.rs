@@ -10,4 +10,5 @@ mod life;
 mod limits;
 mod logs;
 mod node;
+mod shared_memory;
 mod support;

@@ -74,6 +74,9 @@ pub fn act(words: &[String]) -> i32 {
         "chown" => return chown(&words[1], number(2) as u32),
         "write" => return status(std::fs::write(&words[1], "x")),
         "read" => return status(std::fs::read_to_string(&words[1]).map(|text| print!("{text}"))),
+        "share" => return status(share(&words[1], words[2].as_bytes())),
+        "shared" => return status(shared(&words[1]).map(|text| println!("{text}"))),
+        "fill" => return status(fill(&words[1], number(2))),
         "calls" => refused_calls(),
         other => {
             eprintln!("unknown word {other}");
@@ -90,6 +93,72 @@ fn status<T>(result: io::Result<T>) -> i32 {
             eprintln!("{error}");
             error.raw_os_error().unwrap_or(98)
         }
+    }
+}
+
+/// Bytes of a piece of shared memory.
+const PIECE: usize = 4096;
+
+/// A piece of shared memory by its name, as POSIX has it; of zeros where it is new.
+fn piece(name: &str, flags: i32) -> io::Result<*mut u8> {
+    let name = CString::new(name)?;
+    // SAFETY: the name is a string; it outlives the call.
+    let fd = unsafe { libc::shm_open(name.as_ptr(), flags, 0o600) };
+    if fd < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    let size = PIECE as libc::off_t;
+    // SAFETY: no pointers.
+    if flags & libc::O_CREAT != 0 && unsafe { libc::ftruncate(fd, size) } != 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: a new mapping; nothing else is there.
+    let at = unsafe {
+        libc::mmap(
+            std::ptr::null_mut(),
+            PIECE,
+            libc::PROT_READ | libc::PROT_WRITE,
+            libc::MAP_SHARED,
+            fd,
+            0,
+        )
+    };
+    if at == libc::MAP_FAILED {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(at.cast())
+}
+
+/// Writes a text there and stays.
+fn share(name: &str, text: &[u8]) -> io::Result<()> {
+    let at = piece(name, libc::O_CREAT | libc::O_RDWR)?;
+    let length = text.len().min(PIECE);
+    // SAFETY: both are that long, and the one was mapped just now.
+    unsafe { std::ptr::copy_nonoverlapping(text.as_ptr(), at, length) };
+    println!("shared");
+    loop {
+        std::thread::sleep(Duration::from_secs(60));
+    }
+}
+
+/// The text that is there.
+fn shared(name: &str) -> io::Result<String> {
+    let at = piece(name, libc::O_RDWR)?;
+    // SAFETY: that long, mapped for as long as this process lives; whoever wrote it is done.
+    let bytes = unsafe { std::slice::from_raw_parts(at, PIECE) };
+    let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
+    Ok(String::from_utf8_lossy(text).into_owned())
+}
+
+/// Writes so many MiB into a file, and stays.
+fn fill(path: &str, mebibytes: u64) -> io::Result<()> {
+    let mut file = std::fs::File::create(path)?;
+    for _ in 0..mebibytes {
+        file.write_all(&vec![1; 1 << 20])?;
+    }
+    println!("filled");
+    loop {
+        std::thread::sleep(Duration::from_secs(60));
     }
 }
 
