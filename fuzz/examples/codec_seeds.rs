@@ -101,6 +101,19 @@ fn shaded() -> Vec<u8> {
     message.bytes(&samples(1600)).0
 }
 
+/// In the few shades that a mapper leaves.
+fn laddered() -> Vec<u8> {
+    let cells: Vec<u8> = (0..60 * 60usize)
+        .map(|at| match (at % 60, at / 60) {
+            (x, y) if x < 20 || y < 10 => 255,
+            (x, y) => [35, 22, 13, 8, 4, 2, 1, 0][(x + y) / 20 + ((at * 7919) >> 4) % 3],
+        })
+        .collect();
+    let message = Message::stamped().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
+    let message = message.u32(60).u32(60).raw(&[0; 56]);
+    message.bytes(&cells).0
+}
+
 fn scan(rough: bool) -> Vec<u8> {
     let ranges: Vec<f32> = (0..300)
         .map(|beam| match beam % 23 {
@@ -252,7 +265,10 @@ fn main() {
         .collect();
     let kinds = [
         (Schema::Image, images()),
-        (Schema::OccupancyGrid, vec![grids[0].clone(), shaded()]),
+        (
+            Schema::OccupancyGrid,
+            vec![grids[0].clone(), shaded(), laddered()],
+        ),
         (Schema::LaserScan, vec![scan(false), scan(true)]),
         (Schema::PointCloud2, clouds()),
         (Schema::Other, vec![text]),

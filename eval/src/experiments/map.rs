@@ -15,7 +15,7 @@ use crate::robot::Pace;
 use crate::section::{Figure, Missing, Section, Table};
 use crate::statistics::trajectory_error;
 use crate::trace::{Grid, Trace};
-use crate::words::digits;
+use crate::words::{digits, percent};
 
 /// Where the reference is, in the recording.
 const REFERENCE: &str = "/ground_truth";
@@ -201,10 +201,7 @@ fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
             name.clone(),
             trace.requests.len().to_string(),
             trace.answered().to_string(),
-            format!(
-                "{:.0} %",
-                100.0 * trace.answered() as f64 / trace.requests.len().max(1) as f64
-            ),
+            percent(Some(share(trace))),
             metres(error.as_ref().map(|error| error.rmse)),
             metres(error.as_ref().map(|error| error.max)),
             match drive.example.input {
@@ -261,10 +258,8 @@ fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
     let of = |name: &str| {
         let (_, play) = runs.plays.iter().find(|(one, _)| one == name)?;
         let play = play.done()?;
-        let (answered, all) = (play.trace.answered(), play.trace.requests.len().max(1));
         let error = trajectory_error(&play.trace.trajectory(), &play.truth);
-        let error = error.map(|error| error.rmse);
-        Some((100.0 * answered as f64 / all as f64, error))
+        Some((&play.trace, error.map(|error| error.rmse)))
     };
     let said = |error: Option<f64>| {
         error.map_or_else(
@@ -273,13 +268,13 @@ fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
         )
     };
     for (speed, native, stub) in drive.plays {
-        let (Some((alone, error)), Some((share, stubs_error))) = (of(native), of(stub)) else {
+        let (Some((alone, error)), Some((through, stubs_error))) = (of(native), of(stub)) else {
             continue;
         };
         let farther = error
             .zip(stubs_error)
             .is_some_and(|(alone, stub)| stub > alone * ALIKE);
-        let worse = if share < alone {
+        let worse = if fewer(through, alone) {
             "; fewer through the stub is worse than hoped: what the network loses and delays comes to more than what its processor saves"
         } else if farther {
             "; the greater distance through the stub is worse than hoped, and not explained by the share: of one run each, it may be the package's own difference between one choice of scans and another"
@@ -287,11 +282,27 @@ fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
             ""
         };
         let (error, stubs_error) = (said(error), said(stubs_error));
+        let rate = match *speed {
+            1.0 => "its own rate".to_owned(),
+            speed => format!("{speed} of its own rate"),
+        };
+        let [alone, through] = [alone, through].map(|trace| percent(Some(share(trace))));
         section.findings.push(format!(
-            "Of {}, at {speed} of its own rate, the robot works at {alone:.0} % of the scans by itself ({error}), and at {share:.0} % through the stub ({stubs_error}){worse}.",
+            "Of {}, at {rate}, the robot works at {alone} of the scans by itself ({error}), and at {through} through the stub ({stubs_error}){worse}.",
             drive.title
         ));
     }
+}
+
+/// The share of scans that were worked at.
+fn share(trace: &Trace) -> f64 {
+    trace.answered() as f64 / trace.requests.len().max(1) as f64
+}
+
+/// Whether fewer scans were worked at through the stub, by more than one and more than one in a hundred.
+fn fewer(through: &Trace, alone: &Trace) -> bool {
+    let all = alone.requests.len().max(through.requests.len()) as f64;
+    all * (share(alone) - share(through)) > f64::max(1.5, all / 100.0)
 }
 
 fn series(name: &str, path: &[(f64, f64, f64)]) -> Series {
@@ -334,14 +345,15 @@ mod tests {
         let section = section(&runs).expect("a section");
         assert_eq!(
             section.tables[0].rows[0][1..4],
-            ["4", "2", "50 %"].map(str::to_owned)
+            ["4", "2", "50.0 %"].map(str::to_owned)
         );
     }
 
     #[test]
     fn a_stub_that_works_at_fewer_scans_is_told() {
-        let whole = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
-        let half = play(&[Some([0.0, 0.0, 0.0]), None]);
+        let here = Some([0.0, 0.0, 0.0]);
+        let whole = play(&[here, Some([1.0, 0.0, 0.0]), here, here]);
+        let half = play(&[here, None, here, None]);
         let [native, stub] = [DRIVES[0].plays[1].1, DRIVES[0].plays[1].2].map(str::to_owned);
         let runs = Runs {
             plays: vec![
@@ -354,12 +366,27 @@ mod tests {
         let told = &section.findings[0];
         for words in [
             "at 0.33",
-            "100 % of the scans by itself (0.00 m from",
-            "50 % through the stub (without a path",
+            "100.0 % of the scans by itself (",
+            "50.0 % through the stub (",
             "worse than hoped",
         ] {
             assert!(told.contains(words), "{words}: {told}");
         }
+    }
+
+    #[test]
+    fn one_scan_is_no_difference() {
+        let of = |answered: usize, all: usize| {
+            let mut poses = vec![Some([0.0, 0.0, 0.0]); answered];
+            poses.resize(all, None);
+            play(&poses).trace
+        };
+        assert!(!fewer(&of(221, 222), &of(222, 222)));
+        assert!(!fewer(&of(3, 4), &of(4, 4)));
+        assert!(!fewer(&of(997, 1000), &of(1000, 1000)));
+        assert!(fewer(&of(219, 222), &of(222, 222)));
+        assert!(!fewer(&of(222, 222), &of(150, 222)));
+        assert_eq!(percent(Some(share(&of(221, 222)))), "99.5 %");
     }
 
     #[test]
@@ -390,7 +417,10 @@ mod tests {
         assert!(section.tables[0].rows.is_empty());
         assert_eq!(section.tables[1].rows.len(), 2);
         let told = &section.findings[0];
-        for words in ["a simulated drive", "(0.00 m from the truth, RMS)"] {
+        for words in [
+            "a simulated drive, at its own rate,",
+            "(0.00 m from the truth, RMS)",
+        ] {
             assert!(told.contains(words), "{words}: {told}");
         }
     }

@@ -137,7 +137,7 @@ fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
             lacks(section, figure);
             continue;
         };
-        let faster = format!("more than {}", ratio(Some(PUBLISHED / time)));
+        let faster = format!("more than {}", digits(PUBLISHED / time));
         table.push([served, name, &digits(time), "> 5000", &faster]);
         bar("robot served", name, time);
     }
@@ -188,16 +188,14 @@ fn lacks(section: &mut Section, figure: &str) {
 fn compared(peer: &str, ours: f64, theirs: f64) -> String {
     let times = ratio(Some(ours / theirs));
     let (ours_told, theirs_told) = (digits(ours), digits(theirs));
-    let so = format!(
-        "cloudroid's engine has a container running in {ours_told} ms, {peer} in {theirs_told} ms ({times} times as long"
-    );
-    if ours > theirs {
-        format!(
-            "{so}: it also starts a shim with a ROS Master and an init, and reads the limits back)."
-        )
+    let why = if ours > theirs {
+        ": it also starts a shim with a ROS Master and an init, and reads the limits back"
     } else {
-        format!("{so}).")
-    }
+        ""
+    };
+    format!(
+        "cloudroid's engine has a container running in {ours_told} ms, {times} times as long as {peer} ({theirs_told} ms){why}."
+    )
 }
 
 const TRIP: &str = "String there and back";
@@ -335,10 +333,13 @@ mod tests {
         let section = section(&runs()).expect("it is drawn");
         assert!(section.missing.is_empty(), "{:?}", section.missing);
         let rows = &section.tables[0].rows;
-        assert_eq!(rows[0][2..], ["10.0", "> 5000", "more than 500.0"]);
+        assert_eq!(rows[0][2..], ["10.0", "> 5000", "more than 500"]);
         assert_eq!(rows[6][1..3], ["podman", "100"]);
-        assert!(section.findings[0].contains("crun in 20.0 ms (1.2 times as long: it also"));
-        assert!(section.findings[1].contains("podman in 100 ms (0.25 times as long)."));
+        assert!(
+            section.findings[0]
+                .contains("in 25.0 ms, 1.2 times as long as crun (20.0 ms): it also")
+        );
+        assert!(section.findings[1].contains("0.25 times as long as podman (100 ms)."));
     }
 
     #[test]

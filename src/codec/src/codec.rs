@@ -75,8 +75,9 @@ impl Codec {
     /// The version of the codec's frames: raised when they change.
     pub fn version(self) -> u8 {
         match self {
-            // Since 2 with a checksum; grids are told whole.
-            Self::Image | Self::Grid | Self::Scan | Self::Cloud => 2,
+            // Since 2 with a checksum; grids are told whole, and since 3 in shades that are no picture's.
+            Self::Image | Self::Scan | Self::Cloud => 2,
+            Self::Grid => 3,
             _ => 1,
         }
     }

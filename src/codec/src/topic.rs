@@ -115,7 +115,7 @@ impl Encoder {
                 image::encode(message, &Image::read(message, total)?, out)
             }
             (Codec::Grid, Schema::OccupancyGrid) => {
-                grid::encode(message, &Grid::read(message, total)?, out);
+                grid::encode(message, &Grid::read(message, total)?, &mut self.zstd, out);
             }
             (Codec::Scan, Schema::LaserScan) => {
                 scan::encode(message, &Scan::read(message, total)?, out)?

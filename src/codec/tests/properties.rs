@@ -111,13 +111,14 @@ fn image() -> impl Strategy<Value = Vec<u8>> {
 }
 
 fn grid() -> impl Strategy<Value = Vec<u8>> {
-    (1usize..150, 1usize..150, any::<u64>(), 0u32..5, 0u8..4).prop_map(
+    (1usize..150, 1usize..150, any::<u64>(), 0u32..5, 0u8..5).prop_map(
         |(width, height, seed, shift, kind)| {
             let cells: Vec<u8> = samples(width * height, seed, if kind == 3 { 0xff } else { 7 })
                 .iter()
                 .map(|&value| match kind {
                     0 => [255, 0, 100][usize::from(value % 3)],
                     1 => [255, 255, 255, 255, 255, 255, 0, 100][usize::from(value % 8)],
+                    4 => [255, 0, 1, 2, 4, 8, 13, 22, 35, 100][usize::from(value % 10)],
                     _ => value,
                 })
                 .collect();

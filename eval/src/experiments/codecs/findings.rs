@@ -4,7 +4,7 @@ use super::sources::Alone;
 use super::told::{base, done, encoded, lan, saving};
 use super::{Kind, Runs, Sent, Setting, What};
 use crate::statistics::{median, median_interval};
-use crate::words::digits;
+use crate::words::{digits, ratio};
 
 /// Of the medians' intervals, which must not overlap where one is called longer than the other.
 const CONFIDENCE: f64 = 0.95;
@@ -28,16 +28,20 @@ pub(super) fn findings(runs: &Runs) -> Vec<String> {
 
 fn beside_published(what: &What, saved: f64) -> String {
     let (row, published) = what.kind.published();
-    let less = digits(published - saved);
+    // As both are printed.
+    let less = published - (10.0 * saved).round() / 10.0;
     let beside = if saved >= published {
         "at least as many as".to_owned()
-    } else if what.setting.is_lossy() {
-        format!("{less} percentage points less than")
     } else {
-        format!("{less} percentage points less than (and loses nothing)")
+        format!("{less:.1} percentage points less than")
+    };
+    let lossless = if what.setting.is_lossy() {
+        ""
+    } else {
+        " and loses nothing"
     };
     format!(
-        "{}: codec {} saves {saved:.1} % of the bytes, {beside} the publication's row {row} ({published} %).",
+        "{}: codec {} saves {saved:.1} % of the bytes{lossless}: {beside} the publication's row \u{201c}{row}\u{201d} ({published} %).",
         what.kind.name(),
         what.setting.name()
     )
@@ -84,14 +88,24 @@ fn larger_than_deflate(kind: Kind, alone: &Alone) -> Option<String> {
             100.0 * known
         )
     });
-    (ours.bytes[1] > published.bytes[1] || alone.known.is_some()).then(|| {
+    let larger = ours.bytes[1] > published.bytes[1];
+    (larger || alone.known.is_some()).then(|| {
         format!(
-            "{}: the codec {} makes {} bytes of the same messages of which {} makes {}.{known}",
+            "{}: of the same {} bytes the codec {} makes {} and {} {} ({} times as many{}).{known}",
             kind.name(),
+            ours.bytes[0],
             ours.codec,
             ours.bytes[1],
             published.codec,
-            published.bytes[1]
+            published.bytes[1],
+            ratio(Some(
+                ours.bytes[1] as f64 / published.bytes[1].max(1) as f64
+            )),
+            if larger {
+                " by ours: worse than hoped"
+            } else {
+                " by ours"
+            }
         )
     })
 }

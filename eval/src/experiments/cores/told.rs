@@ -17,6 +17,11 @@ const MANY: [f64; 4] = [4.0, 8.0, 16.0, 32.0];
 /// The publication's greatest factor (Fig. 5).
 pub(super) const PUBLISHED: f64 = 25.0;
 
+/// From which error on inside the fitted range the reason is looked for.
+const POOR: f64 = 0.1;
+/// How many times as fast a limit beyond the fitted range makes a program that is said to have gained by it.
+const GAINED: f64 = 1.05;
+
 /// What the report says.
 pub fn section(studies: &[Study]) -> Result<Section> {
     let mut section = Section::new(
@@ -183,11 +188,7 @@ fn findings(section: &mut Section, one: &Found) {
     let Some(model) = &one.model else { return };
     section.findings.extend(inside(one));
     section.findings.extend(beyond(one, model));
-    let computation = |cores: f64| {
-        let of = one.points.iter().find(|point| point.0 == cores);
-        of.map(|point| point.1[1])
-    };
-    if let Some((alone, most)) = computation(1.0).zip(computation(model.most)) {
+    if let Some((alone, most)) = computation(one, 1.0).zip(computation(one, model.most)) {
         if model.most > 1.0 {
             let threads = match subject.threads {
                 1 => "one thread".to_owned(),
@@ -197,7 +198,7 @@ fn findings(section: &mut Section, one: &Found) {
                 "{name}: with {} cores instead of one it computes {:.2} times as fast with {threads}, so {}.",
                 digits(model.most),
                 alone / most,
-                ends(model)
+                ends(one, model)
             ));
         }
     }
@@ -226,15 +227,41 @@ fn inside(one: &Found) -> Option<String> {
         .collect();
     let error = root_mean_square_error(&relative)?;
     let worst = relative.iter().map(|pair| (pair.0 - 1.0).abs());
+    let why = if error > POOR {
+        changing(one).unwrap_or_default()
+    } else {
+        String::new()
+    };
     let limits = match pairs.len() {
         1 => "the limit that was held back".to_owned(),
         many => format!("the {many} limits that were held back"),
     };
     Some(format!(
-        "{}: at {limits} inside the fitted range the model's error is {} (root mean square), at most {}.",
+        "{}: at {limits} inside the fitted range the model's error is {} (root mean square), at most {}{why}.",
         one.name(),
         percent(Some(error)),
         percent(Some(worst.fold(0.0, f64::max)))
+    ))
+}
+
+/// The computation at a limit of cores, seconds.
+fn computation(one: &Found, cores: f64) -> Option<f64> {
+    let of = one.points.iter().find(|point| point.0 == cores);
+    of.map(|point| point.1[1])
+}
+
+/// What the model takes as the same at each limit up to one core, and what it was.
+fn changing(one: &Found) -> Option<String> {
+    let limits = one.points.iter().map(|point| point.0);
+    let least = limits.clone().reduce(f64::min)?;
+    let most = limits.filter(|cores| *cores <= 1.0).reduce(f64::max)?;
+    let work = |cores| Some(milliseconds(Some(cores * computation(one, cores)?)));
+    Some(format!(
+        ", which is worse than hoped: a request's computation is {} core ms at {} cores and {} core ms at {}, while the model has the same work at each limit",
+        work(least)?,
+        digits(least),
+        work(most)?,
+        digits(most)
     ))
 }
 
@@ -259,12 +286,20 @@ fn beyond(one: &Found, model: &Model) -> Option<String> {
 }
 
 /// What the points say of how many cores the program can use.
-fn ends(model: &Model) -> String {
+fn ends(one: &Found, model: &Model) -> String {
     let end = digits(model.parts[1].parallel);
+    let beyond = one.points.iter().find(|point| point.2 == Use::Beyond);
+    let further =
+        beyond.and_then(|point| Some((point.0, computation(one, model.most)? / point.1[1])));
     match (model.has_end(), model.threads) {
-        (false, _) => {
-            "no end of what cores give was seen; where it is, was not measured".to_owned()
-        }
+        (false, _) => match further {
+            Some((cores, faster)) if faster < GAINED => format!(
+                "the model has no end of what cores give, but with {} cores, which were held back, it computes only {faster:.2} times as fast as with {}: whether the program ends there or this machine, whose cores robot and daemon need as well, was not measured",
+                digits(cores),
+                digits(model.most)
+            ),
+            _ => "no end of what cores give was seen; where it is, was not measured".to_owned(),
+        },
         (true, 1) => format!("more than {end} cores are not expected to give anything"),
         (true, _) => format!(
             "above {end} cores nothing was gained: whether the program ends there or this machine, whose cores robot and daemon need as well, was not measured"
@@ -373,6 +408,33 @@ mod tests {
         let last = section.tables[2].rows.last().expect("rows");
         assert_eq!(last[5..], ["50.0", "9.0", "25.0"]);
         assert_eq!(section.figures.len(), 2);
+    }
+
+    #[test]
+    fn cores_that_gave_nothing_where_they_were_held_back_are_told() {
+        let section = section(&[study(SUBJECTS[2], 1.5)]).expect("it is drawn");
+        let told = &section.findings[2];
+        assert!(
+            told.contains("with 1.75 cores, which were held back, it computes only 1.00 times as fast as with 1.50"),
+            "{told}"
+        );
+    }
+
+    #[test]
+    fn work_that_is_not_the_same_at_each_limit_is_told() {
+        let mut study = study(SUBJECTS[2], 8.0);
+        for (cores, measured) in &mut study.runs {
+            if let Measured::Done(reading) = measured {
+                let more = 1.0 + (1.0 - *cores).max(0.0);
+                reading.trace = trace(0.1 * more / *cores);
+            }
+        }
+        let section = section(&[study]).expect("it is drawn");
+        let told = &section.findings[0];
+        assert!(
+            told.contains("computation is 175 core ms at 0.25 cores and 100 core ms at 1.00"),
+            "{told}"
+        );
     }
 
     #[test]

@@ -15,7 +15,7 @@ use crate::experiments::crowd::{self, Controller, LONG, Yard};
 use crate::plots::{self, Bar};
 use crate::section::{Missing, Section, Table};
 use crate::statistics::{mean, quantile};
-use crate::words::{digits, known, milliseconds};
+use crate::words::{known, milliseconds, ratio};
 
 /// The part of its requests that must be in time for a robot to count.
 const IN_TIME: f64 = 0.95;
@@ -249,7 +249,7 @@ impl Runs {
             match on.cmp(&off) {
                 std::cmp::Ordering::Greater if off > 0 => format!(
                     ": {} times as many, because what those that ask seldom leave is given to those that are near what they accept.",
-                    digits(on as f64 / off as f64)
+                    ratio(Some(on as f64 / off as f64))
                 ),
                 std::cmp::Ordering::Greater =>
                     ": what those that ask seldom leave is given to those that are near what they accept.".to_owned(),
@@ -326,7 +326,7 @@ mod tests {
         tell(&gained, &mut section).expect("it is told");
         let found = &section.findings[0];
         assert!(
-            found.contains("1 were served") && found.contains("2.00 times as many"),
+            found.contains("1 were served") && found.contains("2.0 times as many"),
             "{found}"
         );
         assert_eq!(section.tables[0].rows[1][3..5], ["0", "100"]);

@@ -281,15 +281,15 @@ impl Runs {
         };
         let ahead = |times: f64, of: f64| times > of * 1.1;
         section.findings.push(if ahead(weights, limits) {
-            "Limits protect the robot better than weights alone: neighbours that have used up their part leave their cores at once, while \
+            "By their 95 % values, limits protect the robot better than weights alone: neighbours that have used up their part leave their cores at once, while \
              weights let them run whenever the robot pauses, and a core is taken back from them only at the scheduler's next decision."
                 .to_owned()
         } else if ahead(limits, weights) {
-            "Weights alone protect the robot better than limits in this run, which is worse than hoped: the robot itself, or its \
+            "By their 95 % values, weights alone protect the robot better than limits in this run, which is worse than hoped: the robot itself, or its \
              neighbours all at once, begin each period of the limit with their whole part of it."
                 .to_owned()
         } else {
-            "Limits and weights alone protect the robot equally well, within a tenth.".to_owned()
+            "By their 95 % values, limits and weights alone protect the robot equally well, within a tenth.".to_owned()
         });
     }
 }
@@ -331,7 +331,7 @@ mod tests {
              median is 2.0 times that alone, the 95 % value 2.0 times; none: the median is 5.0 times that alone, the 95 % value 5.0 times."
         );
         assert!(
-            section.findings[2].starts_with("Limits protect"),
+            section.findings[2].starts_with("By their 95 % values, limits protect"),
             "{:?}",
             section.findings
         );

@@ -156,15 +156,19 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
     let drawing = plots::points(caption, "servants on the node", "start (s)", &series, false)?;
     section.drawing("scale-starts", caption, drawing);
     let tenth = (times.len() / 10).max(1);
+    let which = match tenth {
+        1 => "one".to_owned(),
+        many => format!("{many}, median"),
+    };
     let (first, last) = (
         median(&times[..tenth]),
         median(&times[times.len() - tenth..]),
     );
     if let (Some(first), Some(last)) = (first, last) {
         section.findings.push(format!(
-            "A new servant has answered its robot's first call after {} s at first and after {} s at last ({} times); over 5 s were published.",
-            digits(first),
-            digits(last),
+            "A new servant has answered its robot's first call after {} ms on an empty node (the first {which}) and after {} ms on a full one (the last {which}), {} times as long; over 5 s were published.",
+            milliseconds(Some(first)),
+            milliseconds(Some(last)),
             ratio(Some(last / first))
         ));
     }
@@ -264,12 +268,13 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
         format!(" By the model robots begin to wait for one another at {knee:.0} robots.")
     });
     let knee = knee.unwrap_or_default();
-    let room = at.plan.robots as f64 + at.point.left.0 / at.memory();
+    let last = &told[told.len() - 1];
     let room = format!(
         "memory, {} MB for each robot, would be enough for {} robots",
-        digits(at.memory() / MEGA),
-        digits(room)
+        digits(last.memory() / MEGA),
+        model::room(last)
     );
+    let times_alone = ratio(times[bent.unwrap_or(0)].map(|time| time / alone));
     let robots = at.plan.robots;
     section.findings.push(if bent.is_none() {
         format!(
@@ -279,20 +284,20 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
         )
     } else if at.busy() >= FULL && at.others() >= OTHERS {
         format!(
-            "At {robots} robots the median is {BENT} times that alone or more, but other programs used {:.0} % of the cores' time: {state}.{knee}",
+            "At {robots} robots the median is {times_alone} times that alone, but other programs used {:.0} % of the cores' time: {state}.{knee}",
             at.others() * 100.0
         )
     } else if at.busy() >= FULL {
         format!(
-            "At {robots} robots the median is {BENT} times that alone or more, because the processor is used up: {state}; {room}.{knee}"
+            "At {robots} robots the median is {times_alone} times that alone, because the processor is used up: {state}; {room}.{knee}"
         )
     } else if memory >= FULL {
         format!(
-            "At {robots} robots the median is {BENT} times that alone or more, because memory is used up: {state}.{knee}"
+            "At {robots} robots the median is {times_alone} times that alone, because memory is used up: {state}.{knee}"
         )
     } else {
         format!(
-            "At {robots} robots the median is {BENT} times that alone or more, although {state}: requests come by chance and wait for \
+            "At {robots} robots the median is {times_alone} times that alone, although {state}: requests come by chance and wait for \
              each other before the cores are used up; {room}.{knee}"
         )
     });

@@ -2,9 +2,7 @@
 //!
 //! The grid is cut into tiles of 64×64 cells and those into blocks of 8×8. A tile, then a block, is either background
 //! or not; a block that is not may be of one value throughout. Only in the remaining blocks cells are told one by
-//! one, row by row across all blocks of a band, each in the context of its neighbours.
-//!
-//! Maps hold three values (unknown, free, occupied): others are told in full.
+//! one, row by row across all blocks of a band, each in the context of its neighbours: how, is for a [`Tell`].
 
 use crate::Error;
 use crate::entropy::binary::{BinaryDecoder, BinaryEncoder, Bit};
@@ -13,65 +11,50 @@ use std::ops::Range;
 
 const TILE: usize = 64;
 const BLOCK: usize = 8;
+/// What a block of one value is guessed to be where nothing is known.
+const UNKNOWN: u8 = 255;
 
-/// Unknown, free, occupied.
-const KNOWN: [u8; 3] = [255, 0, 100];
-/// The class of every other value.
-const OTHER: u8 = 3;
-
-/// Whether a grid has so many values besides the known three that it is better told as a picture.
-pub(super) fn shaded(cells: &[u8], background: u8) -> bool {
-    let (mut others, mut told) = (0usize, 0usize);
-    for pair in cells.windows(2).step_by((cells.len() / 16_384).max(1)) {
-        if pair != [background; 2] {
-            told += 1;
-            others += usize::from(pair[0] != pair[1] && CLASSES[usize::from(pair[1])] == OTHER);
-        }
-    }
-    others * 8 > told
+/// How values are told: by their class, or by their rank among many.
+pub(super) trait Tell {
+    /// The value of a block of one value.
+    fn uniform<S: Side>(&mut self, side: &mut S, guess: u8, known: u8) -> u8;
+    /// The cell at `place`.
+    fn cell<S: Side>(&mut self, side: &mut S, place: Place, known: u8) -> u8;
 }
 
-const CLASSES: [u8; 256] = {
-    let mut classes = [OTHER; 256];
-    let mut class = 0;
-    while class < KNOWN.len() {
-        classes[KNOWN[class] as usize] = class as u8;
-        class += 1;
+/// Where a cell is.
+#[derive(Clone, Copy)]
+pub(super) struct Place {
+    pub(super) x: usize,
+    pub(super) y: usize,
+    width: usize,
+    background: u8,
+}
+
+impl Place {
+    /// The cell `left` columns to the left and `up` rows above; outside of the grid, background.
+    #[inline(always)]
+    pub(super) fn near(self, cells: &[u8], left: isize, up: usize) -> u8 {
+        let column = self.x.wrapping_add_signed(-left);
+        if column < self.width && up <= self.y {
+            cells[(self.y - up) * self.width + column]
+        } else {
+            self.background
+        }
     }
-    classes
-};
+}
 
-/// Contexts of a cell: six neighbours' classes.
-const CONTEXTS: usize = 1 << 12;
-
-/// The decisions' probabilities.
-struct Model {
+/// The decisions' probabilities that are of blocks.
+#[derive(Default)]
+struct Blocks {
     tiles: [Bit; 4],
-    blocks: [Bit; 4],
+    differs: [Bit; 4],
     uniform: [Bit; 4],
-    uniform_value: [Bit; 4],
-    /// Per context: is it another value than guessed? One outside the known three? Which?
-    cells: Vec<[Bit; 4]>,
-    /// A value in full, bit by bit, each in the context of those before.
-    values: Vec<Bit>,
-}
-
-impl Model {
-    fn new() -> Self {
-        Self {
-            tiles: Default::default(),
-            blocks: Default::default(),
-            uniform: Default::default(),
-            uniform_value: Default::default(),
-            cells: vec![Default::default(); CONTEXTS],
-            values: vec![Bit::default(); 256],
-        }
-    }
 }
 
 /// An encoder or a decoder. One walk over the grid serves both: where it asks for what it codes, the encoder looks at
 /// its cells and the decoder at its bits.
-trait Side {
+pub(super) trait Side {
     const ENCODES: bool;
     /// Codes a decision; `known` is what it is, if this side encodes.
     fn bit(&mut self, bit: &mut Bit, known: bool) -> bool;
@@ -127,39 +110,50 @@ impl Side for Decoding<'_> {
     }
 }
 
-/// Appends `cells` as they differ from `background`.
-pub(super) fn encode(cells: &[u8], layout: &Grid, background: u8, out: &mut Vec<u8>) {
+/// Appends `cells` as they differ from `background`; tells how many are in blocks that do.
+pub(super) fn encode<T: Tell>(
+    cells: &[u8],
+    layout: &Grid,
+    background: u8,
+    tell: T,
+    out: &mut Vec<u8>,
+) -> usize {
     let side = Encoding {
         coder: BinaryEncoder::new(),
         cells,
     };
-    out.extend_from_slice(&walk(side, layout, background).coder.finish());
+    let walk = walk(side, layout, background, tell);
+    out.extend_from_slice(&walk.side.coder.finish());
+    walk.told
 }
 
 /// Turns `cells`, which are all `background`, into what was encoded.
-pub(super) fn decode(
+pub(super) fn decode<T: Tell>(
     bytes: &[u8],
     layout: &Grid,
     background: u8,
+    tell: T,
     cells: &mut [u8],
 ) -> Result<(), Error> {
     let side = Decoding {
         coder: BinaryDecoder::new(bytes),
         cells,
     };
-    walk(side, layout, background).coder.finish()
+    walk(side, layout, background, tell).side.coder.finish()
 }
 
-fn walk<S: Side>(side: S, layout: &Grid, background: u8) -> S {
+fn walk<S: Side, T: Tell>(side: S, layout: &Grid, background: u8, tell: T) -> Walk<S, T> {
     let (width, height) = (layout.width, layout.height);
     let mut walk = Walk {
         side,
-        model: Model::new(),
+        tell,
+        bits: Blocks::default(),
         background,
         width,
         plain: vec![background; width],
         tiles: vec![false; width.div_ceil(TILE)],
         blocks: vec![State::Same; width.div_ceil(BLOCK)],
+        told: 0,
     };
     for top in (0..height).step_by(TILE) {
         let bottom = (top + TILE).min(height);
@@ -176,7 +170,7 @@ fn walk<S: Side>(side: S, layout: &Grid, background: u8) -> S {
             }
         }
     }
-    walk.side
+    walk
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -189,9 +183,10 @@ enum State {
     Mixed,
 }
 
-struct Walk<S> {
+struct Walk<S, T> {
     side: S,
-    model: Model,
+    tell: T,
+    bits: Blocks,
     background: u8,
     width: usize,
     /// A row of background.
@@ -199,9 +194,11 @@ struct Walk<S> {
     /// Which tiles of the band are not all background.
     tiles: Vec<bool>,
     blocks: Vec<State>,
+    /// Cells in blocks that differ.
+    told: usize,
 }
 
-impl<S: Side> Walk<S> {
+impl<S: Side, T: Tell> Walk<S, T> {
     fn row_of(&self, y: usize) -> &[u8] {
         &self.side.cells()[y * self.width..(y + 1) * self.width]
     }
@@ -224,7 +221,7 @@ impl<S: Side> Walk<S> {
         let mut left = false;
         for (tile, changed) in self.tiles.iter_mut().zip(changed) {
             let context = usize::from(left) + 2 * usize::from(*tile);
-            left = self.side.bit(&mut self.model.tiles[context], changed);
+            left = self.side.bit(&mut self.bits.tiles[context], changed);
             *tile = left;
         }
     }
@@ -264,13 +261,14 @@ impl<S: Side> Walk<S> {
         let context = |state: State| usize::from(left == state) + 2 * usize::from(above == state);
         if !self
             .side
-            .bit(&mut self.model.blocks[context(State::Same)], differs)
+            .bit(&mut self.bits.differs[context(State::Same)], differs)
         {
             return State::Same;
         }
+        self.told += columns.len() * rows.len();
         if !self
             .side
-            .bit(&mut self.model.uniform[context(State::Uniform)], uniform)
+            .bit(&mut self.bits.uniform[context(State::Uniform)], uniform)
         {
             return State::Mixed;
         }
@@ -278,16 +276,10 @@ impl<S: Side> Walk<S> {
         let guess = match (left, rows.start) {
             (State::Uniform, _) => self.side.cells()[at - 1],
             (_, 1..) => self.side.cells()[at - self.width],
-            _ => KNOWN[0],
+            _ => UNKNOWN,
         };
         let known = self.side.cells()[at];
-        let value = value(
-            &mut self.side,
-            &mut self.model.uniform_value,
-            &mut self.model.values,
-            guess,
-            known,
-        );
+        let value = self.tell.uniform(&mut self.side, guess, known);
         for y in rows {
             self.side.set(
                 y * self.width + columns.start..y * self.width + columns.end,
@@ -307,78 +299,17 @@ impl<S: Side> Walk<S> {
         }
     }
 
-    /// The cell `left` columns left of and `up` rows above (x, y); outside of the grid, background.
-    #[inline(always)]
-    fn near(&self, x: usize, y: usize, left: isize, up: usize) -> u8 {
-        let column = x.wrapping_add_signed(-left);
-        if column < self.width && up <= y {
-            self.side.cells()[(y - up) * self.width + column]
-        } else {
-            self.background
-        }
-    }
-
     #[inline(always)]
     fn cell(&mut self, x: usize, y: usize) {
         let at = y * self.width + x;
-        let west = self.near(x, y, 1, 0);
-        let context = context([
-            west,
-            self.near(x, y, 0, 1),
-            self.near(x, y, 1, 1),
-            self.near(x, y, -1, 1),
-            self.near(x, y, 2, 0),
-            self.near(x, y, 0, 2),
-        ]);
+        let place = Place {
+            x,
+            y,
+            width: self.width,
+            background: self.background,
+        };
         let known = self.side.cells()[at];
-        let bits = &mut self.model.cells[context];
-        let coded = value(&mut self.side, bits, &mut self.model.values, west, known);
-        self.side.set(at..at + 1, coded);
+        let value = self.tell.cell(&mut self.side, place, known);
+        self.side.set(at..at + 1, value);
     }
-}
-
-#[inline(always)]
-fn context<const N: usize>(neighbours: [u8; N]) -> usize {
-    neighbours.into_iter().fold(0, |context, cell| {
-        context << 2 | usize::from(CLASSES[usize::from(cell)])
-    })
-}
-
-/// Codes a cell: as guessed, one of the known values, or any other.
-#[inline(always)]
-fn value<S: Side>(
-    side: &mut S,
-    bits: &mut [Bit; 4],
-    values: &mut [Bit],
-    guess: u8,
-    known: u8,
-) -> u8 {
-    if !side.bit(&mut bits[0], known != guess) {
-        return guess;
-    }
-    if side.bit(&mut bits[1], CLASSES[usize::from(known)] == OTHER) {
-        return full(side, values, known);
-    }
-    let mut candidates = KNOWN.into_iter().filter(|&value| value != guess);
-    let (first, second) = (
-        candidates.next().unwrap_or(0),
-        candidates.next().unwrap_or(0),
-    );
-    if !side.bit(&mut bits[2], known != first) {
-        return first;
-    }
-    match candidates.next() {
-        Some(third) if side.bit(&mut bits[3], known == third) => third,
-        _ => second,
-    }
-}
-
-#[cold]
-fn full<S: Side>(side: &mut S, values: &mut [Bit], known: u8) -> u8 {
-    let mut node = 1usize;
-    for shift in (0..8).rev() {
-        let one = side.bit(&mut values[node], (known >> shift) & 1 != 0);
-        node = node << 1 | usize::from(one);
-    }
-    node as u8
 }

@@ -72,6 +72,11 @@ fn error_of(told: &[Told], node: &Node) -> String {
     )
 }
 
+/// Robots that the memory is enough for of which servants may have a part.
+pub(super) fn room(last: &Told) -> u64 {
+    (MEMORY_PART * last.point.left.1 / last.memory()) as u64
+}
+
 /// Nodes like this one that more robots need.
 fn nodes(told: &[Told], node: &Node, section: &mut Section) {
     let last = &told[told.len() - 1];
@@ -81,7 +86,7 @@ fn nodes(told: &[Told], node: &Node, section: &mut Section) {
         service: node.service * (1.0 - beside),
         ..*node
     };
-    let memory = (MEMORY_PART * last.point.left.1 / last.memory()) as u64;
+    let memory = room(last);
     let admits = last.point.admits;
     let caption = format!(
         "Nodes like this one ({} cores, {:.0} GB) for a mean response time of {:.0} ms at most",

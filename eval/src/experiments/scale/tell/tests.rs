@@ -85,8 +85,17 @@ fn the_bend_and_its_reason_are_told() {
     let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let bend = finding(&section, "times that alone");
     assert!(
-        bend.starts_with("At 64 robots") && bend.contains("the processor is used up"),
+        bend.starts_with(
+            "At 64 robots the median is 10.0 times that alone, because the processor is used up"
+        ),
         "{bend}"
+    );
+    // The same number as in the table of nodes.
+    assert!(bend.contains("would be enough for 720 robots"), "{bend}");
+    let first = finding(&section, "first call");
+    assert!(
+        first.contains("after 300 ms on an empty node (the first one) and"),
+        "{first}"
     );
     let few = told(&[1, 2, 4]);
     let bend = finding(&few, "does not bend");
