@@ -12,6 +12,8 @@ export CLOUDROID_PYTHON := $(VENV)/bin/python
 # The same for programs that read what the daemon answers by HTTP.
 READERS := $(CACHE)/readers-$(shell sha256sum tests/readers/requirements.txt | cut -c1-12)
 export CLOUDROID_READERS := $(READERS)/bin
+# The same with the ROS 2 of a base, for peers of tests.
+export CLOUDROID_ROS2_PREFIX := $(shell scripts/ros2-wheels --where)
 # The same for the stories' client in JavaScript, and the identity provider.
 NODE := $(CACHE)/node-$(shell sha256sum tests/robots/package.json | cut -c1-12)
 export CLOUDROID_NODE_MODULES := $(NODE)/node_modules
@@ -40,6 +42,7 @@ demo-deps:
 test-deps: deps
 	@scripts/python "$(VENV)" demo/requirements.txt
 	@scripts/python "$(READERS)" tests/readers/requirements.txt
+	@scripts/ros2-wheels >/dev/null
 	@scripts/node "$(NODE)" tests/robots/package.json
 	@scripts/node "$(WEB_TEST)" tests/web/package.json
 

@@ -23,15 +23,10 @@ use crate::process::{self, Stream};
 use crate::unused;
 use output::{NAMING, apts_words, parse_relations, parse_stanza, parse_uri};
 
-/// Where packages come from.
+/// Where packages come from: lines of a sources.list for each base that is named. For others they are the host's own apt
+/// sources, where the host is of the same release; else mmdebstrap's default mirror.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub enum Sources {
-    /// The host's own apt sources, where the host is of the same release; else mmdebstrap's default mirror.
-    #[default]
-    Automatic,
-    /// Lines of a sources.list.
-    Lines(Vec<String>),
-}
+pub struct Sources(pub BTreeMap<String, Vec<String>>);
 
 /// One package at one version.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -428,7 +423,8 @@ fn age(path: &Path) -> Option<Duration> {
     SystemTime::now().duration_since(changed).ok()
 }
 
-/// What differs from the host's apt. Hooks of the host's configuration have no business here.
+/// What differs from the host's apt. Hooks of the host's configuration have no business here. Debian has lists of contents for each
+/// component, Ubuntu one for all.
 const CONFIGURATION: &str = r#"
 Dir::State "@ROOT@/state";
 Dir::State::status "@ROOT@/empty-status";
@@ -463,6 +459,16 @@ Acquire::IndexTargets::deb::Contents-deb {
   KeepCompressedAs "gz";
 };
 Acquire::IndexTargets::deb::Contents-deb::DefaultEnabled "true";
+Acquire::IndexTargets::deb::Contents-deb-legacy {
+  MetaKey "Contents-$(ARCHITECTURE)";
+  ShortDescription "Contents-$(ARCHITECTURE)";
+  Description "$(RELEASE) $(ARCHITECTURE) Contents (deb)";
+  KeepCompressed "true";
+  KeepCompressedAs "gz";
+  Fallback-Of "Contents-deb";
+  Identifier "Contents-$(ARCHITECTURE)";
+};
+Acquire::IndexTargets::deb::Contents-deb-legacy::DefaultEnabled "true";
 "#;
 
 #[cfg(test)]

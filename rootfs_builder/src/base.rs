@@ -1,5 +1,7 @@
 //! Base definitions: what a distribution and its ROS are like, as data (`images/NAME.toml`).
 
+mod wheels;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,6 +11,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, IoAt};
 
+pub(crate) use wheels::Required;
+pub use wheels::Wheels;
+
 /// A base image definition.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Base {
@@ -16,6 +21,8 @@ pub struct Base {
     pub name: String,
     /// All the rest.
     pub definition: Definition,
+    /// Of its wheels.
+    pub(crate) required: Required,
 }
 
 impl Base {
@@ -70,11 +77,15 @@ pub struct Definition {
     /// What never gets into a layer.
     #[serde(default)]
     pub strip: Strip,
+    /// Python packages that bring ROS, where the distribution has none of this kind.
+    pub wheels: Option<Wheels>,
     /// The toolchain.
     pub build: Build,
     /// What is particular to some ROS packages.
     #[serde(default)]
     pub ros_packages: RosPackages,
+    /// The base whose `keys` this one has, too. Its own come before.
+    pub keys_of: Option<String>,
     /// rosdep key → Debian packages.
     #[serde(default)]
     pub keys: BTreeMap<String, Vec<String>>,
@@ -125,8 +136,27 @@ pub struct RosPackages {
     pub ignore: BTreeSet<String>,
 }
 
-/// Reads the definition `name` of a directory.
+/// Reads the definition `name` of a directory, and the files that it names.
 pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
+    let mut definition = read(directory, name)?;
+    if let Some(other) = &definition.keys_of {
+        for (key, packages) in read(directory, other)?.keys {
+            definition.keys.entry(key).or_insert(packages);
+        }
+    }
+    let required = match &definition.wheels {
+        Some(wheels) => Required::read(directory, wheels)?,
+        None => Required::default(),
+    };
+    Ok(Base {
+        name: name.to_owned(),
+        definition,
+        required,
+    })
+}
+
+/// Reads one file.
+fn read(directory: &Path, name: &str) -> Result<Definition, Error> {
     let plain = !name.is_empty()
         && name
             .bytes()
@@ -145,11 +175,7 @@ pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
         });
     }
     let text = fs::read_to_string(&path).at("reading", &path)?;
-    let definition = parse(&text).map_err(|problem| Error::BadBase { path, problem })?;
-    Ok(Base {
-        name: name.to_owned(),
-        definition,
-    })
+    parse(&text).map_err(|problem| Error::BadBase { path, problem })
 }
 
 /// Names of all definitions in a directory, sorted.
@@ -209,11 +235,16 @@ fn parse(text: &str) -> Result<Definition, String> {
             ));
         }
     }
+    if let Some(wheels) = &definition.wheels {
+        let at = |problem| format!("{}{problem}", line_of("[wheels]"));
+        wheels.check().map_err(at)?;
+    }
     let absolute = definition
         .build
         .files
         .keys()
-        .chain([&definition.build.prefix]);
+        .chain([&definition.build.prefix])
+        .chain(definition.wheels.as_ref().map(|wheels| &wheels.prefix));
     for path in absolute {
         let climbs = path
             .components()
@@ -239,107 +270,4 @@ pub(crate) fn is_debian_name(name: &str) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const SMALLEST: &str = "summary = \"x\"\ndistribution = \"debian\"\nsuite = \"bookworm\"\nros = \"ros1\"\nros_distribution = \"noetic\"\n\
-        [runtime]\npackages = [\"libroscpp4d\"]\n[build]\npackages = []\nprefix = \"/opt/x\"\n";
-
-    fn ours() -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../images")
-    }
-
-    #[test]
-    fn every_definition_of_the_repository_is_valid() {
-        let names = names(&ours()).expect("the directory is there");
-        assert!(names.contains(&"bookworm-ros1".to_owned()), "{names:?}");
-        for name in names {
-            let base = load(&ours(), &name).expect("valid");
-            assert!(base.keys.contains_key("eigen"), "{name} knows rosdep keys");
-        }
-    }
-
-    #[test]
-    fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
-        let base = load(&ours(), "bookworm-ros1").expect("valid");
-        // As dpkg matches (fnmatch without flags): a star goes over slashes.
-        fn matches(pattern: &[u8], path: &[u8]) -> bool {
-            match (pattern.first(), path.first()) {
-                (None, None) => true,
-                (Some(b'*'), _) => {
-                    matches(&pattern[1..], path)
-                        || (!path.is_empty() && matches(pattern, &path[1..]))
-                }
-                (Some(a), Some(b)) if a == b => matches(&pattern[1..], &path[1..]),
-                _ => false,
-            }
-        }
-        let excluded = |path: &str| {
-            let rules = base.strip.unpacked.iter();
-            rules
-                .filter_map(|rule| rule.strip_prefix("path-exclude="))
-                .any(|rule| matches(rule.as_bytes(), path.as_bytes()))
-        };
-        assert!(!excluded("/usr/share/man/man1"));
-        assert!(excluded("/usr/share/man/man1/java.1.gz"));
-        assert!(excluded("/usr/share/man/de/man1/apt.1.gz"));
-    }
-
-    #[test]
-    fn what_packages_of_strangers_asked_for_is_known() {
-        let base = load(&ours(), "bookworm-ros1").expect("valid");
-        for key in [
-            "bfl",
-            "liborocos-bfl-dev",
-            "libgsl",
-            "libcairo2-dev",
-            "python3-cairosvg",
-            "python3-joblib",
-            "lm-sensors",
-        ] {
-            assert!(base.keys.contains_key(key), "{key}");
-        }
-    }
-
-    #[test]
-    fn tools_that_only_check_have_a_stand_in_and_are_not_missed() {
-        let base = load(&ours(), "bookworm-ros1").expect("valid");
-        for tool in ["roslint", "code_coverage", "ros_pytest"] {
-            let config = format!("/usr/share/{tool}/cmake/{tool}Config.cmake");
-            assert!(base.build.files.contains_key(Path::new(&config)), "{tool}");
-            assert!(base.ros_packages.ignore.contains(tool), "{tool}");
-        }
-    }
-
-    #[test]
-    fn an_unknown_base_is_answered_with_those_known() {
-        for name in ["nonesuch", "../images/bookworm-ros1", ""] {
-            let error = load(&ours(), name).expect_err("not there").to_string();
-            assert!(error.contains("bookworm-ros1"), "{error}");
-        }
-    }
-
-    #[test]
-    fn mistakes_are_named_with_their_line() {
-        parse(SMALLEST).expect("valid");
-        let cases = [
-            (SMALLEST.replace("prefix", "prefixx"), "line 10"),
-            (SMALLEST.replace("libroscpp4d", "Lib Roscpp"), "line 7"),
-            (SMALLEST.replace("/opt/x", "/opt/../x"), "line 10"),
-            (SMALLEST.replace("[\"libroscpp4d\"]", "[]"), "line 6"),
-            (SMALLEST.replace("ros1", "ros7"), "line 4"),
-            (
-                format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"),
-                "line 12",
-            ),
-            (
-                format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"),
-                "line 12",
-            ),
-        ];
-        for (text, line) in cases {
-            let problem = parse(&text).expect_err("a mistake");
-            assert!(problem.starts_with(line), "{problem}");
-        }
-    }
-}
+mod tests;

@@ -60,9 +60,29 @@ pub(crate) async fn resolve(
     if let Some(debs) = shop.layers.note(&note) {
         return Ok(debs);
     }
-    let debs = archive.apt.resolve(None, &names).await?;
+    let debs = archive
+        .apt
+        .resolve(None, &names)
+        .await
+        .map_err(|error| lacking(error, archive, base))?;
     shop.layers.keep_note(&note, &debs)?;
     Ok(debs)
+}
+
+/// Where apt cannot install a base, most often the archive is another one than it is made of.
+fn lacking(error: Error, archive: &Archive, base: &Base) -> Error {
+    let packages = base.runtime.packages.iter();
+    let missing: Vec<&str> = packages
+        .filter(|name| !archive.candidates.contains(name))
+        .map(String::as_str)
+        .collect();
+    match error {
+        Error::Unsolvable { .. } if !missing.is_empty() => Error::BaseLacks {
+            base: base.name.clone(),
+            missing: missing.join(", "),
+        },
+        error => error,
+    }
 }
 
 /// Names the layer by what goes into it.

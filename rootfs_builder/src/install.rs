@@ -409,7 +409,7 @@ pub(crate) fn set_mode(path: &Path, mode: u32) -> Result<(), Error> {
     fs::set_permissions(path, fs::Permissions::from_mode(mode)).at("changing the mode of", path)
 }
 
-fn link_or_copy(from: &Path, to: &Path) -> Result<(), Error> {
+pub(crate) fn link_or_copy(from: &Path, to: &Path) -> Result<(), Error> {
     if fs::hard_link(from, to).is_err() {
         fs::copy(from, to).at("copying", from)?;
     }

@@ -145,6 +145,7 @@ fn spawn_error(program: &OsStr, package: &'static str, error: std::io::Error) ->
         let program = match program.to_str() {
             Some("mmdebstrap") => "mmdebstrap",
             Some("dpkg-deb") => "dpkg-deb",
+            Some("pip3") => "pip3",
             _ => "apt-get",
         };
         return Error::MissingProgram { program, package };

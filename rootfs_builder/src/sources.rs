@@ -5,26 +5,20 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::apt::Sources;
-use crate::base::Definition;
+use crate::base::Base;
 use crate::error::{Error, IoAt};
 use crate::process;
 
 /// The sources.list for a base.
-pub(crate) async fn lines(
-    sources: &Sources,
-    base: &Definition,
-    scratch: &Path,
-) -> Result<String, Error> {
-    match sources {
-        Sources::Lines(lines) => Ok(lines.join("\n") + "\n"),
-        Sources::Automatic => {
-            let own = host(Path::new("/etc/apt"), &base.suite)?;
-            if own.is_empty() {
-                mmdebstraps_default(&base.suite, scratch).await
-            } else {
-                Ok(own)
-            }
-        }
+pub(crate) async fn lines(sources: &Sources, base: &Base, scratch: &Path) -> Result<String, Error> {
+    if let Some(lines) = sources.0.get(&base.name) {
+        return Ok(lines.join("\n") + "\n");
+    }
+    let own = host(Path::new("/etc/apt"), &base.suite)?;
+    if own.is_empty() {
+        mmdebstraps_default(&base.suite, scratch).await
+    } else {
+        Ok(own)
     }
 }
 

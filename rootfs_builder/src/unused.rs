@@ -35,7 +35,9 @@ pub(crate) fn sweep(cache: &Path) {
         return;
     }
     let mut directories: Vec<PathBuf> = ["layers", "notes"].map(|name| cache.join(name)).into();
-    directories.extend(below(&cache.join("chains")));
+    for name in ["chains", crate::wheels::DOWNLOADS] {
+        directories.extend(below(&cache.join(name)));
+    }
     for archive in below(&cache.join("apt")) {
         directories.extend(below(&archive).into_iter().filter(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -82,6 +84,7 @@ mod tests {
         };
         let kinds = [
             "chains/ground",
+            "wheels/list",
             "apt/lab/members-1",
             "apt/lab/imports-1",
             "apt/lab/archives",

@@ -9,10 +9,37 @@ use crate::home::Home;
 use store::private;
 
 /// `images/` of the source tree.
-const BUILT_IN: [(&str, &str); 1] = [(
-    "bookworm-ros1.toml",
-    include_str!("../../../images/bookworm-ros1.toml"),
-)];
+const BUILT_IN: [(&str, &str); 6] = [
+    (
+        "bookworm-jazzy-wheels.build.requirements.txt",
+        include_str!("../../../images/bookworm-jazzy-wheels.build.requirements.txt"),
+    ),
+    (
+        "bookworm-jazzy-wheels.requirements.txt",
+        include_str!("../../../images/bookworm-jazzy-wheels.requirements.txt"),
+    ),
+    (
+        "bookworm-jazzy-wheels.toml",
+        include_str!("../../../images/bookworm-jazzy-wheels.toml"),
+    ),
+    (
+        "bookworm-ros1.toml",
+        include_str!("../../../images/bookworm-ros1.toml"),
+    ),
+    (
+        "jammy-humble.toml",
+        include_str!("../../../images/jammy-humble.toml"),
+    ),
+    (
+        "noble-jazzy.toml",
+        include_str!("../../../images/noble-jazzy.toml"),
+    ),
+];
+
+/// Whether a file is a definition, or the requirements of one.
+fn is_part(name: &str) -> bool {
+    name.ends_with(".toml") || name.ends_with(".requirements.txt")
+}
 
 /// A directory with all definitions. The operator's take the place of those built in with the same name.
 pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
@@ -34,8 +61,8 @@ pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
         let unread = || format!("cannot read the base definitions in {}", theirs.display());
         for entry in std::fs::read_dir(theirs).with_context(unread)? {
             let path = entry.with_context(unread)?.path();
-            if let (Some("toml"), Some(name)) =
-                (path.extension().and_then(|e| e.to_str()), path.file_name())
+            if let Some(name) = path.file_name().and_then(|name| name.to_str())
+                && is_part(name)
             {
                 std::fs::copy(&path, directory.join(name)).with_context(unread)?;
             }
@@ -61,7 +88,7 @@ mod tests {
                     .to_string_lossy()
                     .into_owned()
             })
-            .filter(|name| name.ends_with(".toml"))
+            .filter(|name| is_part(name))
             .collect();
         there.sort();
         assert_eq!(there, BUILT_IN.map(|(name, _)| name));
@@ -72,6 +99,7 @@ mod tests {
         let theirs = tempfile::tempdir().expect("a directory");
         std::fs::write(theirs.path().join("bookworm-ros1.toml"), "mine").expect("written");
         std::fs::write(theirs.path().join("other.toml"), "other").expect("written");
+        std::fs::write(theirs.path().join("other.requirements.txt"), "theirs").expect("written");
         std::fs::write(theirs.path().join("notes.txt"), "no definition").expect("written");
         let parent = tempfile::tempdir().expect("a directory");
         let home = Home::open(parent.path()).expect("free");
@@ -83,6 +111,7 @@ mod tests {
         let read = |name: &str| std::fs::read_to_string(directory.join(name)).ok();
         assert_eq!(read("bookworm-ros1.toml").as_deref(), Some("mine"));
         assert_eq!(read("other.toml").as_deref(), Some("other"));
+        assert_eq!(read("other.requirements.txt").as_deref(), Some("theirs"));
         assert_eq!(read("notes.txt"), None);
     }
 }

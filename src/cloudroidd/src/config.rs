@@ -2,6 +2,7 @@
 //! `systemd/cloudroid.example.toml` shows each key with its default.
 
 mod acme;
+mod archives;
 mod black_box;
 mod class;
 mod doubts;
@@ -29,6 +30,7 @@ use crate::machine;
 
 pub use self::oidc::Oidc;
 pub use acme::Acme;
+pub use archives::Archives;
 pub use black_box::BlackBox;
 pub use class::Class;
 pub use people::People;
@@ -63,6 +65,8 @@ pub struct Config {
     pub keep_servants: Option<bool>,
     /// Directory of base image definitions, searched before those built in.
     pub definitions: Option<PathBuf>,
+    /// Where the packages of bases come from.
+    pub archives: Archives,
     /// Limits of a servant where its push says nothing.
     pub limits: Limits,
     /// Classes that robots may name; `default` is that of robots that name none.
@@ -283,6 +287,7 @@ impl Default for Config {
             isolation: IsolationMode::default(),
             keep_servants: None,
             definitions: None,
+            archives: Archives::default(),
             limits: Limits {
                 cpus: Some(machine::cores()),
                 cpu_weight: Some(100),
@@ -510,6 +515,9 @@ impl Config {
             .check(self.memory.servant)
             .context("[black_box] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
+        self.archives
+            .check()
+            .context("[archives] of the configuration")?;
         self.capacity
             .check()
             .context("[capacity] of the configuration")?;

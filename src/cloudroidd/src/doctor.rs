@@ -30,6 +30,11 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
     checks.push(program("mmdebstrap", "mmdebstrap", "makes base images"));
     checks.push(program("apt-get", "apt", "resolves and fetches packages"));
     checks.push(program("dpkg-deb", "dpkg", "unpacks packages"));
+    checks.push(optional(program(
+        "pip3",
+        "python3-pip",
+        "fetches the wheels that some bases of ROS 2 are made of",
+    )));
     checks.push(apt_lists());
     checks.push(disk_space(home));
     checks.push(init());
@@ -250,6 +255,15 @@ fn program(name: &str, package: &str, what_for: &str) -> Check {
             format!("apt-get install {package}"),
         ),
     }
+}
+
+/// Something without which most works.
+fn optional(check: Check) -> Check {
+    let status = match check.status {
+        CheckStatus::Missing => CheckStatus::Warning,
+        status => status,
+    };
+    Check { status, ..check }
 }
 
 fn apt_lists() -> Check {

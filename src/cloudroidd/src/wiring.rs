@@ -147,7 +147,7 @@ fn builder(
         bases_dir,
         build_dir: home.path().join("build"),
         logs_dir: home.path().join("logs"),
-        sources: rootfs_builder::Sources::default(),
+        sources: config.archives.sources(),
         store: Arc::clone(images),
         sandbox,
         limits: config.push.limits(),

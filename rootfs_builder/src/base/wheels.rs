@@ -1,0 +1,182 @@
+//! A base's ROS that comes as wheels of Python.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, IoAt};
+use crate::requirements::Requirements;
+
+/// Python packages that bring ROS.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Wheels {
+    /// The version of the base's Python: `3.11`.
+    pub python: String,
+    /// That of its C library, by which wheels are chosen: `2.36`.
+    pub glibc: String,
+    /// Where they are put.
+    pub prefix: PathBuf,
+    /// Requirements with hashes, a file beside the definition: what every image has.
+    pub runtime: String,
+    /// The same, present only while a package is compiled.
+    pub build: String,
+    /// Files that are put there besides, of what every image has: path below the prefix → content.
+    #[serde(default)]
+    pub files: BTreeMap<PathBuf, String>,
+    /// In files of CMake: what the wheels' builder had elsewhere → where it is here.
+    #[serde(default)]
+    pub rewrite: BTreeMap<String, String>,
+}
+
+impl Wheels {
+    /// Interfaces of Python that wheels may be compiled for (PEP 425).
+    pub(crate) fn abis(&self) -> impl Iterator<Item = String> {
+        let own = format!("cp{}", self.python.replace('.', ""));
+        [own, "abi3".to_owned(), "none".to_owned()].into_iter()
+    }
+
+    /// Platforms that wheels may be compiled for (PEP 600), the newest first. `machine`: `x86_64`.
+    pub(crate) fn platforms(&self, machine: &str) -> impl Iterator<Item = String> {
+        let minor = self.glibc.rsplit('.').next().unwrap_or_default();
+        let newest: u32 = minor.parse().unwrap_or_default();
+        let numbered = (5..=newest)
+            .rev()
+            .map(|minor| format!("manylinux_2_{minor}"));
+        // Names of 2.17, 2.12 and 2.5 that came before the numbers.
+        let named = ["manylinux2014", "manylinux2010", "manylinux1"];
+        let all: Vec<String> = numbered
+            .chain(named.map(str::to_owned))
+            .map(|kind| format!("{kind}_{machine}"))
+            .collect();
+        all.into_iter()
+    }
+
+    pub(super) fn check(&self) -> Result<(), String> {
+        let numbers = |text: &str, first: &str| {
+            text.strip_prefix(first)
+                .is_some_and(|rest| !rest.is_empty() && rest.bytes().all(|b| b.is_ascii_digit()))
+        };
+        if !numbers(&self.python, "3.") {
+            return Err(format!("{:?} is not a version of Python 3", self.python));
+        }
+        if !numbers(&self.glibc, "2.") {
+            return Err(format!("{:?} is not a version of glibc", self.glibc));
+        }
+        let below = |path: &PathBuf| {
+            let plain = |part| matches!(part, Component::Normal(_));
+            path.file_name().is_some() && path.components().all(plain)
+        };
+        if let Some(path) = self.files.keys().find(|path| !below(path)) {
+            return Err(format!("{path:?} is not a path below the prefix"));
+        }
+        for file in [&self.runtime, &self.build] {
+            if file.is_empty() || file.starts_with('.') || file.contains('/') {
+                return Err(format!(
+                    "{file:?} is not the name of a file beside this one"
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What its files of requirements say.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Required {
+    pub(crate) runtime: Requirements,
+    pub(crate) build: Requirements,
+}
+
+impl Required {
+    pub(super) fn read(directory: &Path, wheels: &Wheels) -> Result<Self, Error> {
+        let read = |file: &String| {
+            let path = directory.join(file);
+            let text = std::fs::read_to_string(&path).at("reading", &path)?;
+            Requirements::parse(&text).map_err(|problem| Error::BadBase { path, problem })
+        };
+        Ok(Self {
+            runtime: read(&wheels.runtime)?,
+            build: read(&wheels.build)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wheels() -> Wheels {
+        Wheels {
+            python: "3.11".to_owned(),
+            glibc: "2.17".to_owned(),
+            prefix: "/opt/ros/jazzy".into(),
+            runtime: "a.txt".to_owned(),
+            build: "b.txt".to_owned(),
+            files: BTreeMap::new(),
+            rewrite: BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn wheels_of_older_systems_are_good_and_those_of_newer_ones_are_not() {
+        let platforms: Vec<String> = wheels().platforms("x86_64").collect();
+        assert_eq!(
+            platforms.first().map(String::as_str),
+            Some("manylinux_2_17_x86_64")
+        );
+        assert_eq!(
+            platforms.last().map(String::as_str),
+            Some("manylinux1_x86_64")
+        );
+        assert!(platforms.contains(&"manylinux2014_x86_64".to_owned()));
+        let abis: Vec<String> = wheels().abis().collect();
+        assert_eq!(abis, ["cp311", "abi3", "none"]);
+    }
+
+    #[test]
+    fn versions_and_files_are_checked() {
+        wheels().check().expect("valid");
+        for (bad, words) in [
+            (
+                Wheels {
+                    python: "2.7".to_owned(),
+                    ..wheels()
+                },
+                "Python 3",
+            ),
+            (
+                Wheels {
+                    glibc: "12".to_owned(),
+                    ..wheels()
+                },
+                "glibc",
+            ),
+            (
+                Wheels {
+                    runtime: "../x".to_owned(),
+                    ..wheels()
+                },
+                "beside",
+            ),
+            (
+                Wheels {
+                    build: String::new(),
+                    ..wheels()
+                },
+                "beside",
+            ),
+            (
+                Wheels {
+                    files: [("../setup.sh".into(), String::new())].into(),
+                    ..wheels()
+                },
+                "below the prefix",
+            ),
+        ] {
+            let problem = bad.check().expect_err(words);
+            assert!(problem.contains(words), "{problem}");
+        }
+    }
+}

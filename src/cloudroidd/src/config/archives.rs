@@ -1,0 +1,94 @@
+//! Where the packages of bases come from, where that is not this host's own apt sources.
+
+use std::collections::BTreeMap;
+
+use anyhow::bail;
+use serde::Deserialize;
+
+/// Lines of a sources.list (sources.list(5)) for each base that is named.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(transparent)]
+pub struct Archives(BTreeMap<String, Vec<String>>);
+
+/// Options by which apt would take what nobody has signed, or what was signed by a key that is weak.
+const UNSIGNED: [&str; 4] = [
+    "trusted=",
+    "allow-insecure=",
+    "allow-weak=",
+    "allow-downgrade-to-insecure=",
+];
+
+impl Archives {
+    pub fn check(&self) -> anyhow::Result<()> {
+        for (base, lines) in &self.0 {
+            if lines.is_empty() {
+                bail!(
+                    "{base} = [] names no archive; leave it out to have this host's own, or write lines of a sources.list"
+                );
+            }
+            for line in lines {
+                let whole = line.starts_with("deb ") && !line.contains(['\n', '\r']);
+                if !whole {
+                    bail!(
+                        "{base} = [{line:?}] is no line of a sources.list; write such as \"deb [signed-by=FILE] ADDRESS SUITE COMPONENT\""
+                    );
+                }
+                if let Some(option) = UNSIGNED.iter().find(|option| line.contains(*option)) {
+                    bail!(
+                        "{option} for {base} would take packages that nobody has signed; name the key ring by signed-by=FILE"
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// As the builder takes them.
+    pub fn sources(&self) -> rootfs_builder::Sources {
+        rootfs_builder::Sources(self.0.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> anyhow::Result<Archives> {
+        let archives: Archives = toml::from_str(text)?;
+        archives.check()?;
+        Ok(archives)
+    }
+
+    #[test]
+    fn archives_are_lines_of_a_sources_list_for_a_base() {
+        let line = "deb [signed-by=/etc/k.gpg] http://mirror.example/ubuntu noble main";
+        let archives = read(&format!("noble-jazzy = [\"{line}\"]")).expect("valid");
+        assert_eq!(archives.sources().0["noble-jazzy"], [line]);
+    }
+
+    #[test]
+    fn what_would_be_taken_without_a_signature_is_refused() {
+        for (text, words) in [
+            ("a = []", "leave it out"),
+            (
+                "a = [\"http://mirror.example noble main\"]",
+                "signed-by=FILE",
+            ),
+            (
+                "a = [\"deb http://x noble main\\ndeb [trusted=yes] http://y noble main\"]",
+                "no line",
+            ),
+            (
+                "a = [\"deb [arch=amd64 trusted=yes] http://mirror.example noble main\"]",
+                "trusted=",
+            ),
+            (
+                "a = [\"deb [allow-insecure=yes] http://mirror.example noble main\"]",
+                "allow-insecure=",
+            ),
+        ] {
+            let error = read(text).expect_err(text).to_string();
+            assert!(error.contains(words), "{error}");
+        }
+    }
+}
