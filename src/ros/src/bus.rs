@@ -1,7 +1,7 @@
 //! The seam behind which a ROS version hides: ROS 1 (Master, TCPROS) or ROS 2 (DDS).
 //!
 //! Messages cross it serialized, reference-counted and never copied per subscriber. What only some ROS versions have is an
-//! extension ([`GlobalParameters`], [`Lending`], [`Hearing`]) that a bus offers, or not.
+//! extension ([`GlobalParameters`], [`NodeParameters`], [`Lending`], [`Hearing`]) that a bus offers, or not.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -19,6 +19,7 @@ mod error;
 mod graph;
 mod lending;
 mod matched;
+mod node_parameters;
 mod parameters;
 mod qos;
 mod queue;
@@ -29,6 +30,10 @@ pub use error::{BusError, CallFate};
 pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
 pub use matched::{Matched, Offer, Peer, PeerId, Refusal, reaches};
+pub use node_parameters::{
+    DoubleRange, IntegerRange, NodeParameters, ParameterDescription, ParameterEvent,
+    ParameterEvents, ParameterKind, ParameterNames,
+};
 pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
 pub use qos::{Durability, Qos, Reliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
@@ -199,6 +204,10 @@ pub trait Bus: Send + Sync + 'static {
     /// The parameters that all nodes share.
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
         Err(BusError::NotOffered("global parameters"))
+    }
+    /// The parameters that each node has of its own.
+    fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        Err(BusError::NotOffered("parameters of nodes"))
     }
     /// Services of other ROS systems.
     fn lending(&self) -> Result<&dyn Lending, BusError> {

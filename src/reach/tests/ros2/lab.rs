@@ -135,13 +135,18 @@ impl Peer {
         said.unwrap_or_else(|_| panic!("it should say {kind}"))
     }
 
-    /// Tells it to do something.
+    /// Tells it to do something, and waits until it says that it has.
     pub async fn obey(&mut self, order: &str) -> Vec<Value> {
+        self.tell(order).await;
+        let kind = order.split(' ').next().unwrap_or_default().to_owned();
+        self.says(&kind).await
+    }
+
+    /// Tells it to do something.
+    pub async fn tell(&mut self, order: &str) {
         let line = format!("{order}\n");
         let written = self.orders.write_all(line.as_bytes()).await;
         written.expect("its input");
-        let kind = order.split(' ').next().unwrap_or_default().to_owned();
-        self.says(&kind).await
     }
 
     /// As by `kill -9`.

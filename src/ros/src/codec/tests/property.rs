@@ -426,6 +426,49 @@ proptest! {
     }
 
     #[test]
+    fn a_message_is_put_behind_others_and_taken_out_again(
+        choices in proptest::collection::vec(any::<u8>(), 0..400),
+        before in proptest::collection::vec(any::<u8>(), 0..20),
+        big_endian in any::<bool>(),
+        padding in any::<u8>(),
+    ) {
+        let write = |before: &[u8], padding| {
+            let mut choices = Choices(choices.iter());
+            let message = random_type(RosVersion::Two, &mut choices);
+            let mut writer = Writer::new(RosVersion::Two, big_endian, padding);
+            writer.out.extend_from_slice(before);
+            writer.message(&message, &mut choices);
+            (message, writer.out)
+        };
+        let (message, alone) = write(&[], 0);
+        let (_, behind) = write(&before, 0);
+        prop_assert_eq!(&embedded::embedded(&message, &alone, 0, &before).unwrap(), &behind);
+        prop_assert_eq!(&embedded::embedded(&message, &behind, before.len(), &[]).unwrap(), &alone);
+        // Whatever pads it, and whatever follows it.
+        let (_, mut padded) = write(&before, padding);
+        padded.extend([padding; 3]);
+        let taken = embedded::embedded(&message, &padded, before.len(), &[]).unwrap();
+        let (mut json, mut expected) = (Vec::new(), Vec::new());
+        to_json(&message, &taken, &mut json, &json_options()).unwrap();
+        to_json(&message, &alone, &mut expected, &json_options()).unwrap();
+        prop_assert_eq!(json, expected);
+    }
+
+    #[test]
+    fn what_is_damaged_is_not_taken_out_or_is_no_longer_than_it_was(
+        choices in proptest::collection::vec(any::<u8>(), 0..300),
+        before in 0..20usize,
+        edits in proptest::collection::vec(any::<(u16, u8, u8)>(), 1..6),
+    ) {
+        let (message, mut bytes) = random(RosVersion::Two, &choices);
+        damage(&mut bytes, &edits);
+        if let Some(taken) = embedded::embedded(&message, &bytes, before, &[]) {
+            // Each value may need other padding than before.
+            prop_assert!(taken.len() <= 8 * bytes.len());
+        }
+    }
+
+    #[test]
     fn damaged_input_is_refused_or_makes_a_message(
         choices in proptest::collection::vec(any::<u8>(), 0..300),
         edits in proptest::collection::vec(any::<(u16, u8, u8)>(), 1..6),

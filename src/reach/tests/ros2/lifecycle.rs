@@ -1,0 +1,54 @@
+use std::sync::Arc;
+
+use ros::bus::{Bus, ParamValue};
+use ros::ros2::lifecycle::{LifecycleNode, State, StateChange, StateChanges, Transition};
+use tokio::time::timeout;
+
+use super::lab::{LONG, Lab};
+use super::parameters::tuned;
+
+const STAGED: &str = "/lab/staged";
+
+async fn next(changes: &mut StateChanges) -> StateChange {
+    let change = timeout(LONG, changes.next()).await;
+    change.expect("a change").expect("the bus is open")
+}
+
+#[tokio::test]
+async fn a_node_is_configured_and_activated() {
+    let lab = Lab::new();
+    let (bus, _nodes) = tuned(&lab).await;
+    let graph = Arc::clone(&bus.graph().borrow());
+    assert!(LifecycleNode::is_one(&graph, STAGED));
+    assert!(!LifecycleNode::is_one(&graph, "/lab/tuned"));
+    let node = LifecycleNode::of(bus.clone(), STAGED);
+    assert_eq!(node.state().await.unwrap(), State::Unconfigured);
+    let known = node.transitions().await.unwrap();
+    let labels: Vec<&str> = known.iter().map(|(label, _)| &**label).collect();
+    assert_eq!(labels, ["configure", "shutdown"]);
+
+    node.change(Transition::Configure, LONG).await.unwrap();
+    assert_eq!(node.state().await.unwrap(), State::Inactive);
+    let again = node.change(Transition::Configure, LONG).await.unwrap_err();
+    assert_eq!(
+        again.to_string(),
+        "service /lab/staged/change_state failed: /lab/staged did not configure, and is inactive now"
+    );
+    let parameters = bus.node_parameters().unwrap();
+    let broken = |value| vec![("broken".to_owned(), Some(ParamValue::Bool(value)))];
+    parameters.set(STAGED, broken(true)).await.unwrap();
+    node.change(Transition::Activate, LONG).await.unwrap_err();
+    parameters.set(STAGED, broken(false)).await.unwrap();
+
+    let mut changes = node.watch().await.unwrap();
+    node.change(Transition::Activate, LONG).await.unwrap();
+    for (from, to) in [
+        (State::Inactive, State::Activating),
+        (State::Activating, State::Active),
+    ] {
+        assert_eq!(next(&mut changes).await, StateChange { from, to });
+    }
+    assert_eq!(node.state().await.unwrap(), State::Active);
+    node.change(Transition::Shutdown, LONG).await.unwrap();
+    assert_eq!(node.state().await.unwrap(), State::Finalized);
+}

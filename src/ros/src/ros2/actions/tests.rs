@@ -1,0 +1,89 @@
+mod goals;
+mod messages;
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use tokio::sync::mpsc;
+
+use crate::bus::{ActionHandler, GoalEnd, GoalEvents, RosVersion};
+use crate::codec::from_json;
+use crate::schema::{ActionDef, MessageType, Registry};
+
+/// The action of this text: goal, result, feedback.
+fn action(text: &str) -> Arc<ActionDef> {
+    let registry = Registry::of(RosVersion::Two);
+    registry.insert("test_msgs/action/Fibonacci", text).unwrap();
+    registry.action("test_msgs/Fibonacci").unwrap()
+}
+
+fn fibonacci() -> Arc<ActionDef> {
+    action("int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n")
+}
+
+fn cdr(of: &MessageType, json: &str) -> Bytes {
+    let mut bytes = Vec::new();
+    from_json(of, json.as_bytes(), &mut bytes, &Default::default()).unwrap();
+    bytes.into()
+}
+
+/// What a server's handler hears.
+#[derive(Debug, PartialEq)]
+enum Heard {
+    Goal(String, Bytes),
+    Cancel(String),
+}
+
+/// Tells what it hears, and takes all goals, or none.
+struct Handler {
+    heard: mpsc::UnboundedSender<Heard>,
+    takes: bool,
+}
+
+impl Handler {
+    fn new(takes: bool) -> (Arc<Self>, mpsc::UnboundedReceiver<Heard>) {
+        let (heard, hears) = mpsc::unbounded_channel();
+        (Arc::new(Self { heard, takes }), hears)
+    }
+}
+
+impl ActionHandler for Handler {
+    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+        let _ = self.heard.send(Heard::Goal(id.to_owned(), goal));
+        self.takes.then_some(()).ok_or_else(|| "no".to_owned())
+    }
+
+    fn cancel(&self, id: &str) {
+        let _ = self.heard.send(Heard::Cancel(id.to_owned()));
+    }
+
+    fn failed(&self, reason: &str) {
+        panic!("{reason}");
+    }
+}
+
+/// What whoever has sent a goal hears.
+#[derive(Debug, PartialEq)]
+enum Told {
+    Feedback(Bytes),
+    Ended(Result<GoalEnd, String>),
+}
+
+struct Events(mpsc::UnboundedSender<Told>);
+
+impl Events {
+    fn new() -> (Arc<Self>, mpsc::UnboundedReceiver<Told>) {
+        let (told, hears) = mpsc::unbounded_channel();
+        (Arc::new(Self(told)), hears)
+    }
+}
+
+impl GoalEvents for Events {
+    fn feedback(&self, feedback: Bytes) {
+        let _ = self.0.send(Told::Feedback(feedback));
+    }
+
+    fn ended(&self, end: Result<GoalEnd, String>) {
+        let _ = self.0.send(Told::Ended(end));
+    }
+}

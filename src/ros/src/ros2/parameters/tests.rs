@@ -1,0 +1,2 @@
+mod odd_nodes;
+mod values;

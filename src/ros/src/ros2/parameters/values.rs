@@ -1,0 +1,257 @@
+//! Values of parameters in messages (`rcl_interfaces/msg/ParameterValue`): a number that says which of nine fields counts,
+//! and all nine.
+
+use base64_simd::STANDARD as BASE64;
+
+use super::reading::Reading;
+use crate::bus::{ParamValue, ParameterKind};
+use crate::codec::put::Put;
+
+/// Doubles hold all integers up to here, and not all beyond.
+const EXACT: u64 = 1 << 53;
+
+/// A value of a kind that ROS 2 knows.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Typed {
+    NotSet,
+    Bool(bool),
+    Integer(i64),
+    Double(f64),
+    String(String),
+    Bytes(Vec<u8>),
+    Bools(Vec<bool>),
+    Integers(Vec<i64>),
+    Doubles(Vec<f64>),
+    Strings(Vec<String>),
+}
+
+impl ParameterKind {
+    /// By its number in `rcl_interfaces/msg/ParameterType`. One that nobody knows holds nothing that can be told.
+    pub(super) fn of(number: u8) -> Self {
+        match number {
+            1 => Self::Bool,
+            2 => Self::Integer,
+            3 => Self::Double,
+            4 => Self::String,
+            5 => Self::Bytes,
+            6 => Self::Bools,
+            7 => Self::Integers,
+            8 => Self::Doubles,
+            9 => Self::Strings,
+            _ => Self::NotSet,
+        }
+    }
+}
+
+/// Whether the value may have to become one of another kind, or is of none by itself.
+pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
+    !matches!(
+        value,
+        ParamValue::Bool(_) | ParamValue::Binary(_) | ParamValue::Nil
+    )
+}
+
+/// The value as a parameter of this kind takes it, where nothing is lost by that; else as it is, for the node to judge.
+pub(super) fn typed(value: ParamValue, kind: ParameterKind) -> Result<Typed, String> {
+    let natural = match (value, kind) {
+        (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => {
+            Typed::Double(value as f64)
+        }
+        (ParamValue::Double(value), ParameterKind::Integer) if is_integer(value) => {
+            Typed::Integer(value as i64)
+        }
+        // Bytes have no JSON of their own: they come as base64, or as numbers.
+        (ParamValue::String(text), ParameterKind::Bytes) => {
+            match BASE64.decode_to_vec(text.as_bytes()) {
+                Ok(bytes) => Typed::Bytes(bytes),
+                Err(_) => Typed::String(text),
+            }
+        }
+        (ParamValue::List(items), kind) => list(items, kind)?,
+        (ParamValue::Nil, _) => Typed::NotSet,
+        (ParamValue::Bool(value), _) => Typed::Bool(value),
+        (ParamValue::Int(value), _) => Typed::Integer(value),
+        (ParamValue::Double(value), _) => Typed::Double(value),
+        (ParamValue::String(text), _) => Typed::String(text),
+        (ParamValue::Binary(bytes), _) => Typed::Bytes(bytes),
+        (ParamValue::Map(_), _) => {
+            return Err(
+                "a parameter of ROS 2 holds no dictionary: set each of its values".to_owned(),
+            );
+        }
+    };
+    Ok(natural)
+}
+
+fn list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<Typed, String> {
+    let by_kind = match kind {
+        ParameterKind::Bytes => all(&items, byte).map(Typed::Bytes),
+        ParameterKind::Bools => all(&items, bool).map(Typed::Bools),
+        ParameterKind::Integers => all(&items, integer).map(Typed::Integers),
+        ParameterKind::Doubles => all(&items, double).map(Typed::Doubles),
+        ParameterKind::Strings => all(&items, text).map(Typed::Strings),
+        _ => None,
+    };
+    if let Some(typed) = by_kind {
+        return Ok(typed);
+    }
+    if items.is_empty() {
+        return Err("an empty list does not say what it is a list of".to_owned());
+    }
+    let whole = |item: &ParamValue| match item {
+        ParamValue::Int(value) => Some(*value),
+        _ => None,
+    };
+    all(&items, bool)
+        .map(Typed::Bools)
+        .or_else(|| all(&items, whole).map(Typed::Integers))
+        .or_else(|| all(&items, double).map(Typed::Doubles))
+        .or_else(|| all(&items, text).map(Typed::Strings))
+        .ok_or_else(|| {
+            "a list holds values of one kind: all true or false, numbers, or texts".to_owned()
+        })
+}
+
+fn all<T>(items: &[ParamValue], one: impl Fn(&ParamValue) -> Option<T>) -> Option<Vec<T>> {
+    items.iter().map(one).collect()
+}
+
+fn byte(item: &ParamValue) -> Option<u8> {
+    integer(item).and_then(|value| u8::try_from(value).ok())
+}
+
+fn bool(item: &ParamValue) -> Option<bool> {
+    match item {
+        ParamValue::Bool(value) => Some(*value),
+        _ => None,
+    }
+}
+
+fn integer(item: &ParamValue) -> Option<i64> {
+    match item {
+        ParamValue::Int(value) => Some(*value),
+        ParamValue::Double(value) if is_integer(*value) => Some(*value as i64),
+        _ => None,
+    }
+}
+
+fn double(item: &ParamValue) -> Option<f64> {
+    match item {
+        ParamValue::Double(value) => Some(*value),
+        ParamValue::Int(value) if is_exact(*value) => Some(*value as f64),
+        _ => None,
+    }
+}
+
+fn text(item: &ParamValue) -> Option<String> {
+    match item {
+        ParamValue::String(text) => Some(text.clone()),
+        _ => None,
+    }
+}
+
+fn is_exact(value: i64) -> bool {
+    value.unsigned_abs() <= EXACT
+}
+
+fn is_integer(value: f64) -> bool {
+    value.fract() == 0.0 && value.abs() <= EXACT as f64
+}
+
+/// Writes a value.
+pub(super) fn write(value: &Typed, put: &mut Put) {
+    use Typed::*;
+    let number = match value {
+        NotSet => 0,
+        Bool(_) => 1,
+        Integer(_) => 2,
+        Double(_) => 3,
+        String(_) => 4,
+        Bytes(_) => 5,
+        Bools(_) => 6,
+        Integers(_) => 7,
+        Doubles(_) => 8,
+        Strings(_) => 9,
+    };
+    put.byte(number);
+    put.byte(u8::from(*value == Bool(true)));
+    let integer = if let Integer(value) = value {
+        *value
+    } else {
+        0
+    };
+    put.number(integer.to_le_bytes());
+    let double = if let Double(value) = value {
+        *value
+    } else {
+        0.0
+    };
+    put.number(double.to_le_bytes());
+    put.text(if let String(text) = value { text } else { "" });
+    let bytes: &[u8] = if let Bytes(bytes) = value { bytes } else { &[] };
+    put.length(bytes.len());
+    put.bytes(bytes);
+    let bools: &[bool] = if let Bools(bools) = value { bools } else { &[] };
+    put.length(bools.len());
+    bools.iter().for_each(|one| put.byte(u8::from(*one)));
+    let integers: &[i64] = if let Integers(all) = value { all } else { &[] };
+    put.length(integers.len());
+    integers
+        .iter()
+        .for_each(|one| put.number(one.to_le_bytes()));
+    let doubles: &[f64] = if let Doubles(all) = value { all } else { &[] };
+    put.length(doubles.len());
+    doubles.iter().for_each(|one| put.number(one.to_le_bytes()));
+    let texts: &[std::string::String] = if let Strings(all) = value { all } else { &[] };
+    put.length(texts.len());
+    texts.iter().for_each(|one| put.text(one));
+}
+
+/// Reads a value; none in it where the parameter holds nothing.
+pub(super) fn read(reading: &mut Reading<'_>) -> Option<Option<ParamValue>> {
+    let kind = ParameterKind::of(reading.byte()?);
+    let bool = reading.byte()? != 0;
+    let integer = reading.integer()?;
+    let double = reading.double()?;
+    let text = reading.bytes_of_text()?;
+    let bytes = reading.bytes()?;
+    let bools = reading.bytes()?;
+    let integers = reading.numbers()?;
+    let doubles = reading.numbers()?;
+    let texts = match kind {
+        ParameterKind::Strings => Some(reading.texts()?),
+        _ => reading.skip_texts().map(|()| None)?,
+    };
+    Some(match kind {
+        ParameterKind::NotSet => None,
+        ParameterKind::Bool => Some(ParamValue::Bool(bool)),
+        ParameterKind::Integer => Some(ParamValue::Int(integer)),
+        ParameterKind::Double => Some(ParamValue::Double(double)),
+        ParameterKind::String => Some(ParamValue::String(text_of(text))),
+        ParameterKind::Bytes => Some(ParamValue::Binary(bytes.to_vec())),
+        ParameterKind::Bools => {
+            reading.spend(bools.len())?;
+            let bools = bools.iter().map(|byte| ParamValue::Bool(*byte != 0));
+            Some(ParamValue::List(bools.collect()))
+        }
+        ParameterKind::Integers => {
+            reading.spend(integers.len())?;
+            let integers = integers.map(|number| ParamValue::Int(i64::from_le_bytes(number)));
+            Some(ParamValue::List(integers.collect()))
+        }
+        ParameterKind::Doubles => {
+            reading.spend(doubles.len())?;
+            let doubles = doubles.map(|number| ParamValue::Double(f64::from_le_bytes(number)));
+            Some(ParamValue::List(doubles.collect()))
+        }
+        ParameterKind::Strings => {
+            let texts = texts.unwrap_or_default().into_iter();
+            Some(ParamValue::List(texts.map(ParamValue::String).collect()))
+        }
+    })
+}
+
+/// What is no UTF-8 is replaced.
+fn text_of(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
