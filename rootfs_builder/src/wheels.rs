@@ -303,9 +303,15 @@ async fn install(
                     opened: None,
                 }],
                 environment: environment.into(),
-                argv: ["/usr/bin/python3", "-I", "/cloudroid/wheels.py"]
-                    .map(str::to_owned)
-                    .into(),
+                argv: [
+                    "/usr/bin/python3",
+                    "-I",
+                    "/cloudroid/wheels.py",
+                    "/cloudroid/job.json",
+                    "/cloudroid/wheels",
+                ]
+                .map(str::to_owned)
+                .into(),
             },
             |line| {
                 if line.starts_with("::wheel ") {
@@ -330,34 +336,4 @@ async fn install(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::key::sha256;
-
-    fn wanted(bytes: &[u8]) -> Requirements {
-        let text = format!("ros-x==1.0 --hash=sha256:{}\n", sha256(bytes));
-        Requirements::parse(&text).expect("valid")
-    }
-
-    #[tokio::test]
-    async fn only_what_is_whole_is_taken_from_the_cache() {
-        let cache = tempfile::tempdir().expect("a directory");
-        let wanted = wanted(b"good");
-        let missing = at_hand(&cache.path().join("none"), &wanted).await;
-        assert_eq!(missing.expect("looked"), None);
-        let file = cache.path().join("ros_x-1.0-py3-none-any.whl");
-        fs::write(&file, "damaged").expect("written");
-        assert_eq!(at_hand(cache.path(), &wanted).await.expect("looked"), None);
-        fs::write(&file, "good").expect("written");
-        let found = at_hand(cache.path(), &wanted).await.expect("looked");
-        assert_eq!(found, Some(vec![file]));
-    }
-
-    #[test]
-    fn pips_errors_are_told_without_its_chatter() {
-        let lines =
-            "Looking in indexes: x\nCollecting a\nERROR: No matching distribution found for a==9\n";
-        assert_eq!(pips_words(lines), "No matching distribution found for a==9");
-        assert_eq!(pips_words("boom"), "boom");
-    }
-}
+mod tests;

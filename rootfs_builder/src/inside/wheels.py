@@ -1,7 +1,7 @@
 """Puts wheels below a prefix as ROS is laid out there: modules in lib/pythonX.Y/site-packages, all else as it is named.
 
-Runs as root in a container without network. In: /cloudroid/job.json and the wheels that it names, below /cloudroid/wheels.
-Out: the prefix; a line `::wheel NAME` for each. The same wheels give the same files.
+Runs as root in a container without network: `wheels.py JOB DIRECTORY`. In: the job, and the wheels that it names, in the
+directory. Out: the prefix; a line `::wheel NAME` for each. The same wheels give the same files.
 
 The form of wheels: https://packaging.python.org/en/latest/specifications/binary-distribution-format/
 """
@@ -16,7 +16,6 @@ import stat
 import sys
 import zipfile
 
-WHEELS = "/cloudroid/wheels"
 PROGRAM = """#!%s
 import sys
 from %s import %s
@@ -69,8 +68,8 @@ class Prefix:
         self.write(os.path.join(self.path, "bin", name), text.encode(), True)
 
 
-def install(wheel, prefix):
-    with zipfile.ZipFile(os.path.join(WHEELS, wheel)) as archive:
+def install(directory, wheel, prefix):
+    with zipfile.ZipFile(os.path.join(directory, wheel)) as archive:
         for info in sorted(archive.infolist(), key=lambda info: info.filename):
             # Compiled elsewhere: the times of sources in it are not those of the files here.
             if info.is_dir() or info.filename.endswith(".pyc"):
@@ -121,18 +120,18 @@ def compile_modules(prefix):
                 print("not compiled: %s" % error.msg.strip().splitlines()[-1], flush=True)
 
 
-def main():
+def main(path, directory):
     os.umask(0o022)
-    with open("/cloudroid/job.json", encoding="utf-8") as file:
+    with open(path, encoding="utf-8") as file:
         job = json.load(file)
     prefix = Prefix(job["prefix"], job["rewrite"])
     for wheel in job["wheels"]:
         print("::wheel " + wheel, flush=True)
-        install(wheel, prefix)
+        install(directory, wheel, prefix)
     for path, text in sorted(job["files"].items()):
         prefix.write(os.path.join(prefix.path, path), text.encode(), False)
     share_libraries(prefix)
     compile_modules(prefix)
 
 
-main()
+main(*sys.argv[1:])
