@@ -2,8 +2,13 @@
 
 use std::collections::BTreeSet;
 
+use ros::flavour::Version;
+
+use crate::archive::Archive;
+use crate::base::Base;
 use crate::contents::Contents;
 use crate::error::Error;
+use crate::keys;
 
 /// Something missing, under the name that the output gives it.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -16,37 +21,105 @@ enum Missed<'a> {
     Library(String),
 }
 
+/// Where missing things are looked for.
+#[derive(Clone, Copy)]
+pub(crate) struct Known<'a> {
+    contents: &'a Contents,
+    /// Of a base of ROS 2, whose distribution has packages of ROS 1: those are not meant.
+    two: Option<Two<'a>>,
+}
+
+#[derive(Clone, Copy)]
+struct Two<'a> {
+    archive: &'a Archive,
+    base: &'a Base,
+}
+
+impl<'a> Known<'a> {
+    /// To a base and its archive.
+    pub(crate) fn of(archive: &'a Archive, base: &'a Base) -> Self {
+        Self {
+            contents: &archive.contents,
+            two: (base.ros != Version::Ros1).then_some(Two { archive, base }),
+        }
+    }
+
+    /// The package to add for a missing configuration of CMake.
+    fn config(&self, name: &str) -> Option<String> {
+        let mut debs = self.contents.cmake_config(name);
+        match self.two {
+            // As a ROS package it comes whole: its definitions and plugins, too.
+            None if !self.contents.ros_package(name).is_empty() => Some(name.to_owned()),
+            None => nearest(&debs, name).map(str::to_owned),
+            Some(two) => two.deb_of(name).or_else(|| {
+                debs.retain(|deb| two.fits(deb));
+                nearest(&debs, name).map(str::to_owned)
+            }),
+        }
+    }
+
+    /// The package to add for a missing module of Python.
+    fn module(&self, name: &str) -> Option<String> {
+        let mut debs = self.contents.python_module(name);
+        match self.two {
+            None => nearest(&debs, name).map(str::to_owned),
+            Some(two) => two.deb_of(name).or_else(|| {
+                debs.retain(|deb| two.fits(deb));
+                nearest(&debs, name).map(str::to_owned)
+            }),
+        }
+    }
+
+    /// The package to add for a missing library.
+    fn library(&self, name: &str) -> Option<String> {
+        let deb = self.contents.library(name)?;
+        let fits = self.two.is_none_or(|two| two.fits(deb));
+        fits.then(|| deb.to_owned())
+    }
+
+    /// Where a program of another ROS package is.
+    fn programs(&self, program: &str) -> String {
+        if self.two.is_some() {
+            return String::new();
+        }
+        let places = self.contents.programs(program).into_iter();
+        let places: Vec<String> = places
+            .map(|(package, deb)| {
+                format!(
+                    "; the ROS package {package} (Debian's {deb}) has it: push with `--apt {package}`, or add \
+                     `--with {package}` and write `--node {package}/{program}`"
+                )
+            })
+            .collect();
+        places.concat()
+    }
+}
+
+impl Two<'_> {
+    fn deb_of(&self, name: &str) -> Option<String> {
+        keys::deb_of(self.archive, self.base, name)
+    }
+
+    fn fits(&self, deb: &str) -> bool {
+        !keys::is_of_other_ros(self.archive, self.base, deb)
+    }
+}
+
 /// One line of advice for each missing thing that `words` names; empty if it names none.
-pub(crate) fn for_words(words: &str, contents: &Contents) -> Vec<String> {
+pub(crate) fn for_words(words: &str, known: Known<'_>) -> Vec<String> {
     let missed: BTreeSet<Missed<'_>> = words.lines().filter_map(missed).collect();
     missed
         .into_iter()
         .map(|missed| match missed {
-            Missed::Config(name) => {
-                let ros = !contents.ros_package(name).is_empty();
-                let mut debs = contents.cmake_config(name);
-                if ros {
-                    debs.insert(name);
-                }
-                // As a ROS package it comes whole: its definitions and plugins, too.
-                let with = if ros {
-                    Some(name)
-                } else {
-                    nearest(&debs, name)
-                };
-                told(&format!("the CMake package {name}"), with)
-            }
-            Missed::Module(name) => told(
-                &format!("the Python module {name}"),
-                nearest(&contents.python_module(name), name),
-            ),
-            Missed::Library(name) => told(&format!("the library {name}"), contents.library(&name)),
+            Missed::Config(name) => told(&format!("the CMake package {name}"), known.config(name)),
+            Missed::Module(name) => told(&format!("the Python module {name}"), known.module(name)),
+            Missed::Library(name) => told(&format!("the library {name}"), known.library(&name)),
         })
         .collect()
 }
 
 /// The error of a failed build with that advice.
-pub(crate) fn on(error: Error, contents: &Contents) -> Error {
+pub(crate) fn on(error: Error, known: Known<'_>) -> Error {
     match error {
         Error::BuildFailed {
             package,
@@ -54,7 +127,7 @@ pub(crate) fn on(error: Error, contents: &Contents) -> Error {
             last_lines,
             ..
         } => Error::BuildFailed {
-            advice: for_words(&last_lines, contents),
+            advice: for_words(&last_lines, known),
             package,
             log,
             last_lines,
@@ -62,31 +135,23 @@ pub(crate) fn on(error: Error, contents: &Contents) -> Error {
         Error::NotInPackage {
             what: what @ "executable",
             name,
-            known,
+            known: there,
             ..
-        } => {
-            let program = name.rsplit('/').next().unwrap_or(&name);
-            let places = contents.programs(program).into_iter();
-            let places: Vec<String> = places
-                .map(|(package, deb)| {
-                    format!(
-                        "; the ROS package {package} (Debian's {deb}) has it: push with `--apt {package}`, or add \
-                         `--with {package}` and write `--node {package}/{program}`"
-                    )
-                })
-                .collect();
-            Error::NotInPackage {
-                elsewhere: places.concat(),
-                what,
-                name,
-                known,
-            }
-        }
+        } => Error::NotInPackage {
+            elsewhere: known.programs(name.rsplit('/').next().unwrap_or(&name)),
+            what,
+            name,
+            known: there,
+        },
+        Error::NoLaunch { module, .. } => Error::NoLaunch {
+            with: known.module(&module),
+            module,
+        },
         other => other,
     }
 }
 
-fn told(what: &str, with: Option<&str>) -> String {
+fn told(what: &str, with: Option<String>) -> String {
     match with {
         Some(name) => format!("{what} is missing: push with `--with {name}`"),
         None => format!(
@@ -152,6 +217,13 @@ mod tests {
         (directory, contents)
     }
 
+    fn of_one(contents: &Contents) -> Known<'_> {
+        Known {
+            contents,
+            two: None,
+        }
+    }
+
     #[test]
     fn what_is_missed_is_named_with_the_option_that_adds_it() {
         let (_directory, contents) = contents();
@@ -186,9 +258,9 @@ mod tests {
                  its source, too",
             ),
         ] {
-            assert_eq!(for_words(words, &contents), [advice], "{words}");
+            assert_eq!(for_words(words, of_one(&contents)), [advice], "{words}");
         }
-        assert!(for_words("main.cpp:3: error: expected ;", &contents).is_empty());
+        assert!(for_words("main.cpp:3: error: expected ;", of_one(&contents)).is_empty());
     }
 
     #[test]
@@ -200,12 +272,55 @@ mod tests {
             known: "none".into(),
             elsewhere: String::new(),
         };
-        let text = on(error, &contents).to_string();
+        let text = on(error, of_one(&contents)).to_string();
         assert!(
             text.contains("there are: none")
                 && text.contains("`--apt topic_tools`")
                 && !text.contains("gcc"),
             "{text}"
+        );
+    }
+
+    #[test]
+    fn on_a_base_of_ros_2_the_distributions_ros_1_is_not_advised() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let modules = "usr/lib/python3/dist-packages";
+        let text = format!(
+            "usr/share/tf2_ros/package.xml libdevel/libtf2-ros-dev\n\
+             usr/share/tf2_ros/cmake/tf2_rosConfig.cmake libdevel/libtf2-ros-dev\n\
+             {modules}/tf2_ros/__init__.py python/python3-tf2-ros\n\
+             {modules}/joblib/__init__.py python/python3-joblib\n"
+        );
+        let lists = [list(directory.path(), "c.gz", &text)];
+        let images = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let mut base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        base.definition.ros = Version::Ros2;
+        base.definition.ros_distribution = "jazzy".to_owned();
+        let mut archive = Archive {
+            apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
+            contents: Contents::open(directory.path(), &lists)
+                .expect("read")
+                .into(),
+            candidates: crate::candidates::tests::named(&["python3-tf2-ros", "python3-joblib"]),
+            stamp: String::new(),
+            sources: String::new(),
+        };
+        let words = "ModuleNotFoundError: No module named 'tf2_ros'\n\
+                     Could not find a package configuration file provided by \"tf2_ros\"\n\
+                     ModuleNotFoundError: No module named 'joblib'";
+        let advice = for_words(words, Known::of(&archive, &base)).join("\n");
+        assert_eq!(
+            advice.matches("no package of the archive has it").count(),
+            2,
+            "{advice}"
+        );
+        assert!(advice.contains("`--with python3-joblib`"), "{advice}");
+        archive.candidates = crate::candidates::tests::named(&["ros-jazzy-tf2-ros"]);
+        let advice = for_words(words, Known::of(&archive, &base)).join("\n");
+        assert_eq!(
+            advice.matches("`--with ros-jazzy-tf2-ros`").count(),
+            2,
+            "{advice}"
         );
     }
 }

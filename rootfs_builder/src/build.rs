@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use image::{Digest, ImageSpec};
 use package::inventory::{Inventory, Published};
+use ros::flavour::Version;
 
 use crate::advice;
 use crate::apt::Deb;
@@ -14,8 +15,10 @@ use crate::archive::Archive;
 use crate::base::Base;
 use crate::error::Error;
 use crate::event::Progress;
+use crate::indexed;
 use crate::install::{self, Addition, Made};
 use crate::key::Key;
+use crate::keys;
 use crate::launch::{self, Ask, LaunchPlan};
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
 use crate::workshop::{Layer, Workshop};
@@ -50,6 +53,12 @@ impl Build<'_> {
     /// The base layer alone, as what others are put on.
     pub(crate) fn on_base(&self) -> Vec<Digest> {
         self.base_layer.diff_ids().collect()
+    }
+
+    /// ROS packages of ROS 2 that are in these layers.
+    pub(crate) async fn indexed(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
+        let trees = self.shop.extracted(layers).await?;
+        indexed::packages(&self.base, trees).await
     }
 
     /// Layers with these Debian packages, and what they need, on top of `below`.
@@ -111,7 +120,12 @@ impl Build<'_> {
     }
 
     /// Names given with `--with`: ROS packages first, then Debian ones.
-    pub(crate) fn extra_packages(&self) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
+    pub(crate) async fn extra_packages(
+        &self,
+    ) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
+        if self.base.ros != Version::Ros1 {
+            return Ok((BTreeSet::new(), self.extra_of_two().await?));
+        }
         let (mut ros, mut debs) = (BTreeSet::new(), BTreeSet::new());
         let mut missing = Vec::new();
         for name in &self.request.with {
@@ -138,6 +152,28 @@ impl Build<'_> {
             Ok((ros, debs))
         } else {
             Err(Error::Unresolved(missing))
+        }
+    }
+
+    /// The same on a base of ROS 2: Debian packages, without ROS packages that are there already.
+    async fn extra_of_two(&self) -> Result<BTreeSet<String>, Error> {
+        if self.request.with.is_empty() {
+            return Ok(BTreeSet::new());
+        }
+        let there = self.indexed(&self.on_base()).await?;
+        let (mut debs, mut missing) = (BTreeSet::new(), Vec::new());
+        let wanted = self.request.with.iter();
+        for name in wanted.filter(|name| !there.contains(*name)) {
+            match keys::named(&self.archive, &self.base, name) {
+                Some(deb) => {
+                    debs.insert(deb);
+                }
+                None => missing.push(keys::unresolved(&self.archive, &self.base, name, "--with")),
+            }
+        }
+        match missing.is_empty() {
+            true => Ok(debs),
+            false => Err(Error::Unresolved(missing)),
         }
     }
 
@@ -180,7 +216,7 @@ impl Build<'_> {
             &ask,
         )
         .await
-        .map_err(|error| advice::on(error, &self.archive.contents))?;
+        .map_err(|error| advice::on(error, advice::Known::of(&self.archive, &self.base)))?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }

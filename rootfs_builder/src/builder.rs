@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use image::{Digest, Store};
 use package::workspace::Pushed;
+use ros::flavour::Version;
 use servant::sandbox::Sandbox;
 use servant::spec::Limits;
 use tokio::sync::mpsc;
@@ -19,14 +20,17 @@ use crate::build::Build;
 use crate::cache::{Entry, Layers};
 use crate::error::{Error, IoAt};
 use crate::event::{BuildEvent, Progress};
+use crate::indexed::Indexed;
 use crate::install::Made;
 use crate::removal::Removals;
 use crate::request::{BuildOutcome, PushRequest, Source};
 use crate::sandbox::{self, Site};
 use crate::workshop::{Turns, Workshop};
-use crate::{blocking, keys, packaged, prebuilt, pushed, seal, source, sources, unused};
+use crate::{
+    blocking, choice, keys, packaged, prebuilt, pushed, seal, source, sources, unused, wheels,
+};
 
-/// The base taken when none is named.
+/// The base taken when none is named, for what can be built for ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
 
 /// Logs of failed builds that are kept.
@@ -112,10 +116,16 @@ impl Builder {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
-        let base = base::load(
-            &self.config.bases_dir,
-            request.base.as_deref().unwrap_or(DEFAULT_BASE),
-        )?;
+        let choice::Chosen { base, note } = privilege::reading(|| {
+            choice::choose(
+                &self.config.bases_dir,
+                request.base.as_deref(),
+                &request.source,
+            )
+        })?;
+        if let Some(note) = note {
+            progress.warn(note).await;
+        }
         let site = Site::new(
             &self.config.build_dir,
             &request.id,
@@ -138,15 +148,10 @@ impl Builder {
         };
         let archive = self.archive(&shop, &base, progress).await?;
         if let What::Tree(pushed) = &what {
-            // What nothing provides is said now, not after minutes of preparations.
-            let own = pushed::names(pushed.packages());
-            let mut asked = pushed::asked(pushed.packages());
-            if matches!(pushed, Pushed::Installed(_)) {
-                asked.build.clear();
-            }
-            keys::resolve(&archive, &base, &request.map, &own, &asked)?;
+            early(&archive, &base, request, pushed)?;
         }
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
+        let base_layer = wheels::on_base(&shop, &base, base_layer, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let build = Build {
             shop,
@@ -180,9 +185,12 @@ impl Builder {
     /// Empty if the output names nothing missing.
     pub async fn advice(&self, base: &str, words: &str) -> Vec<String> {
         let archives = self.archives.lock().await;
-        archives.get(base).map_or_else(Vec::new, |archive| {
-            crate::advice::for_words(words, &archive.contents)
-        })
+        match (archives.get(base), base::load(&self.config.bases_dir, base)) {
+            (Some(archive), Ok(base)) => {
+                crate::advice::for_words(words, crate::advice::Known::of(archive, &base))
+            }
+            _ => Vec::new(),
+        }
     }
 
     /// Layers that no image needs and the next build will: bases and toolchains, by diff-id. For the store's garbage
@@ -264,6 +272,27 @@ impl Builder {
         }
         Ok((made, archive))
     }
+}
+
+/// Says what nothing provides now, and not after minutes of preparations. Of ROS 2 much may be in a base that is not made
+/// yet: there it is said once that can be looked at.
+fn early(
+    archive: &Archive,
+    base: &Base,
+    request: &PushRequest,
+    pushed: &Pushed,
+) -> Result<(), Error> {
+    if base.ros != Version::Ros1 {
+        return Ok(());
+    }
+    let own = pushed::names(pushed.packages());
+    let mut asked = pushed::asked(pushed.packages());
+    if matches!(pushed, Pushed::Installed(_)) {
+        asked.build.clear();
+    }
+    let there = Indexed::default();
+    keys::resolve(archive, base, &request.map, &own, &asked, &there)?;
+    Ok(())
 }
 
 fn made_of(entry: &Entry, cached: bool) -> Made {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use foreign::Visit;
 use image::TreeOptions;
+use ros::flavour::Version;
 use rustix::fs::{AtFlags, FileType, Mode};
 use serde::Serialize;
 use servant::container::{Mount, Profile};
@@ -31,14 +32,15 @@ pub(crate) struct Unit {
     pub(crate) name: String,
     /// Its directory, relative to the pushed tree.
     pub(crate) path: PathBuf,
-    /// `catkin` or `cmake`.
+    /// `catkin`, `ament_cmake`, `ament_python` or `cmake`.
     pub(crate) build_type: String,
 }
 
 /// What is done with packages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Task {
-    /// They are configured, against stand-ins of those among them that they need: most mistakes show in seconds.
+    /// They are looked at before time is spent on compiling any: most mistakes show in seconds. Those of ROS 1 are
+    /// configured, against stand-ins of those among them that they need; of ROS 2 the package.xml is read.
     Check,
     /// They are compiled and installed.
     Compile,
@@ -166,7 +168,7 @@ pub(crate) async fn run(
     let mut files = BTreeMap::from([
         (
             PathBuf::from("cloudroid/compile.py"),
-            COMPILE.as_bytes().to_vec(),
+            script(base.ros).as_bytes().to_vec(),
         ),
         (
             PathBuf::from("cloudroid/job.json"),
@@ -193,6 +195,9 @@ pub(crate) async fn run(
         ("ROS_HOME", "/build/home/.ros"),
     ] {
         environment.insert(name.into(), value.into());
+    }
+    for (name, value) in conditions(base) {
+        environment.entry(name.into()).or_insert(value);
     }
     // Compiled Python is wanted here: it goes into the layer.
     environment.remove("PYTHONDONTWRITEBYTECODE");
@@ -302,7 +307,26 @@ pub(crate) async fn run(
     })
 }
 
-const COMPILE: &str = include_str!("inside/compile.py");
+/// What compiles packages of a ROS.
+fn script(ros: Version) -> &'static str {
+    match ros {
+        Version::Ros1 => include_str!("inside/compile.py"),
+        Version::Ros2 => include_str!("inside/colcon.py"),
+    }
+}
+
+/// What conditions in a package.xml ask for, where a base does not say it itself: colcon reads them, too.
+fn conditions(base: &Base) -> Vec<(&'static str, String)> {
+    match base.ros {
+        // To Debian's catkin ROS_DISTRO would mean a second ROS.
+        Version::Ros1 => Vec::new(),
+        Version::Ros2 => vec![
+            ("ROS_VERSION", base.ros.bus().number().to_string()),
+            ("ROS_DISTRO", base.ros_distribution.clone()),
+            ("ROS_PYTHON_VERSION", "3".to_owned()),
+        ],
+    }
+}
 
 fn title(line: &str, units: &[Unit]) -> Option<String> {
     let name = line.strip_prefix("::package ")?;
@@ -310,14 +334,36 @@ fn title(line: &str, units: &[Unit]) -> Option<String> {
     Some(format!("compiling {name} ({at} of {})", units.len()))
 }
 
-/// make's and CMake's own chatter pushes what the compiler said out of the last lines.
+/// make's, Ninja's, CMake's and setuptools' own chatter pushes what the compiler said out of the last lines.
 fn worth_showing(line: &str) -> bool {
-    let chatter =
-        line.starts_with("make[") || line.starts_with("gmake[") || line.starts_with("-- ");
-    let progress = line.starts_with('[')
-        && line.get(4..6).is_some_and(|rest| rest == "%]")
-        && !line.contains("Error");
+    const CHATTER: [&str; 9] = [
+        "make[",
+        "gmake[",
+        "-- ",
+        "copying ",
+        "creating ",
+        "running ",
+        "writing ",
+        "reading ",
+        "byte-compiling ",
+    ];
+    let chatter = CHATTER.iter().any(|start| line.starts_with(start));
+    let progress = is_progress(line) && !line.contains("Error");
     !chatter && !progress && !line.trim().is_empty()
+}
+
+/// `[ 50%] …` as make says it, or `[3/12] …` as Ninja does.
+fn is_progress(line: &str) -> bool {
+    let Some((inside, _)) = line.strip_prefix('[').and_then(|rest| rest.split_once(']')) else {
+        return false;
+    };
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    match inside.split_once('/') {
+        Some((done, all)) => is_number(done) && is_number(all),
+        None => inside
+            .strip_suffix('%')
+            .is_some_and(|part| is_number(part.trim())),
+    }
 }
 
 /// What was pushed may be readable by its owner alone; the compiling user is another.
@@ -386,6 +432,8 @@ mod tests {
             "x.cpp:3:5: error: 'y' was not declared",
             "CMake Error at CMakeLists.txt:3",
             "  3 | y();",
+            "[rosidl] cannot read Foo.msg",
+            "FAILED: x.o",
         ] {
             assert!(worth_showing(line), "{line}");
         }
@@ -395,6 +443,8 @@ mod tests {
             "-- Found x",
             "",
             "[100%] Built",
+            "[3/12] Building C object x.o",
+            "copying node.py -> build/lib/p",
         ] {
             assert!(!worth_showing(line), "{line}");
         }

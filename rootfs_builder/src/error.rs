@@ -64,6 +64,24 @@ pub enum Error {
         /// apt's own words.
         words: String,
     },
+    /// Python packages of a base that could not be had.
+    #[error(
+        "Python packages could not be downloaded: {words}; they are fetched by this host's pip, from where that is configured to"
+    )]
+    Wheels {
+        /// pip's own words.
+        words: String,
+    },
+    /// The archive is not the one that a base is made of.
+    #[error(
+        "the package archive has not what base {base} is made of: {missing}; its sources.list can be configured ([archives])"
+    )]
+    BaseLacks {
+        /// The base.
+        base: String,
+        /// Debian packages that are not there.
+        missing: String,
+    },
     /// Names that nothing provides.
     #[error("{}", unresolved_text(.0))]
     Unresolved(Vec<Unresolved>),
@@ -121,12 +139,14 @@ pub enum Error {
         /// What is wrong with it.
         problem: String,
     },
-    /// roslaunch refused the launch file.
-    #[error("roslaunch cannot load {file}: {words}")]
+    /// The image's own launch program refused the launch file.
+    #[error("{program} cannot load {file}: {words}")]
     Launch {
+        /// `roslaunch` or `ros2 launch`.
+        program: &'static str,
         /// The launch file.
         file: String,
-        /// roslaunch's own words.
+        /// Its own words.
         words: String,
     },
     /// No such launch file or executable in the image.
@@ -151,9 +171,72 @@ pub enum Error {
         /// Launch files of the package.
         launch_files: String,
     },
+    /// A package of the other ROS than the base's.
+    #[error(
+        "{package} {because}, which is ROS {version}, but base {base} is of ROS {base_version}; push it with {fitting}"
+    )]
+    WrongRos {
+        /// The package.
+        package: String,
+        /// Why it is of its ROS: `has build type catkin`.
+        because: String,
+        /// Its ROS: 1 or 2.
+        version: u8,
+        /// The base that was asked for.
+        base: String,
+        /// The base's ROS.
+        base_version: u8,
+        /// Options that name bases which fit.
+        fitting: String,
+    },
+    /// No base of a package's ROS.
+    #[error(
+        "{package} {because}, and this server has no base of ROS {version}; add a definition of one to the directory of base definitions"
+    )]
+    NoBase {
+        /// The package.
+        package: String,
+        /// Why it is of its ROS.
+        because: String,
+        /// 1 or 2.
+        version: u8,
+    },
+    /// `--apt` on a base that knows no archive of ROS packages.
+    #[error(
+        "base {base} has no archive with a package {name} of ROS 2 {distribution}; push its source, or take a base with that archive (--base)"
+    )]
+    NotInRosArchive {
+        /// What was asked for.
+        name: String,
+        /// The base.
+        base: String,
+        /// Of which ROS.
+        distribution: String,
+    },
+    /// A launch file of ROS 2 in an image that cannot read any.
+    #[error(
+        "the image has no Python package {module}, without which launch files of ROS 2 cannot be read: name the nodes with --node, or {}",
+        with.as_ref().map_or_else(|| format!("push a workspace that also holds {module}"), |deb| format!("push with --with {deb}"))
+    )]
+    NoLaunch {
+        /// `launch` or `launch_ros`, or what they need themselves.
+        module: String,
+        /// The Debian package that has it.
+        with: Option<String>,
+    },
+    /// An install space that was made for another Python.
+    #[error(
+        "the install space was made for {made_for}, and the base has {there}: push the workspace, or build it on the base's own distribution"
+    )]
+    OtherPython {
+        /// Such as `python3.12`.
+        made_for: String,
+        /// Such as `python3.11`.
+        there: String,
+    },
     /// A package this base cannot compile.
     #[error(
-        "package {package} has build type {build_type}, which base {base} cannot build: it builds catkin and cmake"
+        "package {package} has build type {build_type}, which base {base} cannot build: it builds {builds}"
     )]
     BuildType {
         /// The package.
@@ -162,6 +245,8 @@ pub enum Error {
         build_type: String,
         /// The base.
         base: String,
+        /// The build types that it builds.
+        builds: &'static str,
     },
     /// The running package does not show what it should.
     #[error("{0}")]

@@ -1,4 +1,4 @@
-//! What is to run: nodes and parameters, as the image's own roslaunch understands the launch file.
+//! What is to run: nodes and parameters, as the image's own roslaunch, or launch of ROS 2, understands the launch file.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -124,6 +124,13 @@ enum Refusal {
         file: String,
         status: i32,
     },
+    NoLaunch {
+        module: String,
+    },
+    Python {
+        made_for: String,
+        there: String,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -133,10 +140,25 @@ enum Reply {
     Planned(Answer),
 }
 
-/// What resolves launch files, by the image's own tools.
-fn script(ros: Version) -> &'static str {
+/// What resolves launch files, by the image's own tools: the script that is started first.
+fn scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
     match ros {
-        Version::Ros1 => include_str!("inside/launch_plan.py"),
+        Version::Ros1 => vec![("launch_plan.py", include_str!("inside/launch_plan.py"))],
+        Version::Ros2 => vec![
+            ("ros2_plan.py", include_str!("inside/ros2_plan.py")),
+            (
+                "ros2_launch_plan.py",
+                include_str!("inside/ros2_launch_plan.py"),
+            ),
+        ],
+    }
+}
+
+/// What reads launch files, for people.
+fn launcher(ros: Version) -> &'static str {
+    match ros {
+        Version::Ros1 => "roslaunch",
+        Version::Ros2 => "ros2 launch",
     }
 }
 
@@ -151,17 +173,17 @@ pub(crate) async fn ask(
     let directory = shop.site.fresh("plan")?;
     let (tools, out) = (directory.join("tools"), directory.join("out"));
     let question = serde_json::to_vec(ask).unwrap_or_default();
-    lay_out(
-        &tools,
-        &BTreeMap::from([
-            (
-                PathBuf::from("cloudroid/launch_plan.py"),
-                script(ros).as_bytes().to_vec(),
-            ),
-            (PathBuf::from("cloudroid/ask.json"), question),
-            (PathBuf::from("cloudroid/out/.keep"), Vec::new()),
-        ]),
-    )?;
+    let scripts = scripts(ros);
+    let mut files = BTreeMap::from([
+        (PathBuf::from("cloudroid/ask.json"), question),
+        (PathBuf::from("cloudroid/out/.keep"), Vec::new()),
+    ]);
+    let place = |name: &str| format!("cloudroid/{name}");
+    for (name, text) in &scripts {
+        files.insert(place(name).into(), text.as_bytes().to_vec());
+    }
+    lay_out(&tools, &files)?;
+    let first = scripts.first().map_or("", |(name, _)| *name);
     fs::create_dir(&out).at("making", &out)?;
     // The container's root is nobody in particular out here; the directories above let nobody else in.
     set_mode(&out, 0o777)?;
@@ -190,9 +212,7 @@ pub(crate) async fn ask(
                     opened: None,
                 }],
                 environment,
-                argv: ["/usr/bin/python3", "/cloudroid/launch_plan.py"]
-                    .map(str::to_owned)
-                    .into(),
+                argv: vec!["/usr/bin/python3".to_owned(), format!("/{}", place(first))],
             },
             |_| {},
         )
@@ -207,12 +227,12 @@ pub(crate) async fn ask(
             last_lines: finished.last_words(),
         });
     };
-    let answer = privilege::reading(|| understand(&text))?;
+    let answer = privilege::reading(|| understand(&text, ros))?;
     plan::check(&answer)?;
     Ok(answer)
 }
 
-fn understand(text: &[u8]) -> Result<Answer, Error> {
+fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
     let list = |names: &[String]| {
         if names.is_empty() {
             "none".to_owned()
@@ -223,7 +243,13 @@ fn understand(text: &[u8]) -> Result<Answer, Error> {
     match serde_json::from_slice::<Reply>(text) {
         Ok(Reply::Planned(answer)) => Ok(answer),
         Ok(Reply::Refused { error }) => Err(match error {
-            Refusal::Launch { file, words } => Error::Launch { file, words },
+            Refusal::Launch { file, words } => Error::Launch {
+                program: launcher(ros),
+                file,
+                words,
+            },
+            Refusal::NoLaunch { module } => Error::NoLaunch { module, with: None },
+            Refusal::Python { made_for, there } => Error::OtherPython { made_for, there },
             Refusal::NotFound { what, name, known } => Error::NotInPackage {
                 what: if what == "executable" {
                     "executable"
@@ -242,7 +268,7 @@ fn understand(text: &[u8]) -> Result<Answer, Error> {
                 launch_files: list(&launch_files),
             },
             Refusal::Setup { file, status } => Error::Inside {
-                what: "sourcing the install space's setup.sh",
+                what: "sourcing the install space's setup script",
                 last_lines: format!("{file} ended with status {status}"),
             },
         }),
@@ -254,6 +280,9 @@ fn understand(text: &[u8]) -> Result<Answer, Error> {
 }
 
 #[cfg(test)]
+mod of_two;
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -262,7 +291,7 @@ mod tests {
         let text = br#"{"nodes":[{"name":"/a","package":"p","executable":"x","argv":["/x","__name:=a"],"remaps":{},
             "environment":{},"directory":null,"respawn":true,"respawn_delay":1.5,"required":false}],
             "parameters":{"/a/k":[1,2.5,"x",true]},"environment":{},"warnings":[],"executables":[],"launch_files":[]}"#;
-        let answer = understand(text).expect("a plan");
+        let answer = understand(text, Version::Ros1).expect("a plan");
         let spec = answer.nodes[0].spec("/root/.ros");
         assert_eq!(
             (spec.directory.as_str(), spec.respawn, spec.respawn_delay),
@@ -277,23 +306,54 @@ mod tests {
     #[test]
     fn refusals_keep_roslaunchs_words_and_name_what_there_is() {
         let launch = br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
-        let text = understand(launch).expect_err("refused").to_string();
+        let text = understand(launch, Version::Ros1)
+            .expect_err("refused")
+            .to_string();
         assert_eq!(
             text,
             "roslaunch cannot load /x.launch: requires the 'manager' arg to be set"
         );
         let node =
             br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
-        let text = understand(node).expect_err("refused").to_string();
+        let text = understand(node, Version::Ros1)
+            .expect_err("refused")
+            .to_string();
         assert_eq!(
             text,
             "there is no executable \"y\" in the package; there are: a, b"
         );
         let nothing = br#"{"error":{"kind":"nothing","executables":["a","b"],"launch_files":[]}}"#;
-        let text = understand(nothing).expect_err("refused").to_string();
+        let text = understand(nothing, Version::Ros1)
+            .expect_err("refused")
+            .to_string();
         assert!(
             text.contains("executables: a, b; launch files: none"),
             "{text}"
+        );
+    }
+
+    #[test]
+    fn what_ros_2_cannot_resolve_names_the_reason_and_the_next_step() {
+        let refused = |text: &[u8]| {
+            let error = understand(text, Version::Ros2).expect_err("refused");
+            error.to_string()
+        };
+        let text = refused(br#"{"error":{"kind":"no_launch","module":"launch"}}"#);
+        assert!(
+            text.contains("no Python package launch") && text.contains("--node"),
+            "{text}"
+        );
+        let text =
+            refused(br#"{"error":{"kind":"python","made_for":"python3.12","there":"python3.11"}}"#);
+        assert!(
+            text.contains("made for python3.12, and the base has python3.11"),
+            "{text}"
+        );
+        let launch =
+            br#"{"error":{"kind":"launch","file":"/x.launch.py","words":"no such argument"}}"#;
+        assert_eq!(
+            refused(launch),
+            "ros2 launch cannot load /x.launch.py: no such argument"
         );
     }
 }

@@ -7,9 +7,9 @@
 //!                       │                                                             │
 //!    apt, dpkg  ──▶  dependency layers ◀── package.xml, Contents index, ELF files ────┤
 //!                       │                                                             │
-//!    catkin     ──▶  package layer ◀────── sources, compiled in a sandbox ────────────┘
+//!  catkin, colcon ▶  package layer ◀────── sources, compiled in a sandbox ────────────┘
 //!                       │
-//!    roslaunch  ──▶  what to run ──▶ started once by the caller ──▶ probe ──▶ interface
+//!    launch     ──▶  what to run ──▶ started once by the caller ──▶ probe ──▶ interface
 //! ```
 //!
 //! In: a [`PushRequest`]. Out: a [`BuildOutcome`] with an untagged image in the store and a [`LaunchPlan`]; [`probe`]
@@ -31,6 +31,7 @@ mod builder;
 mod cache;
 mod candidates;
 mod chain;
+mod choice;
 mod compile;
 mod complaint;
 mod contents;
@@ -40,6 +41,7 @@ mod error;
 mod event;
 mod gather;
 mod imports;
+mod indexed;
 mod install;
 mod key;
 mod keys;
@@ -55,6 +57,7 @@ mod process;
 mod pushed;
 mod removal;
 mod request;
+mod requirements;
 mod sandbox;
 mod seal;
 mod source;
@@ -63,6 +66,7 @@ mod split;
 mod steps;
 mod units;
 mod unused;
+mod wheels;
 mod workshop;
 
 pub use apt::Sources;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 
 use crate::build::{Build, Parts};
@@ -11,12 +12,16 @@ use crate::gather::{self, Wanted};
 use crate::imports::Programs;
 use crate::install::Made;
 use crate::key::Key;
+use crate::keys;
 use crate::request::{PushRequest, Source};
 
 /// `name`: a ROS package, or a Debian package that holds some.
 pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
+    if build.base.ros != Version::Ros1 {
+        return of_two(build, name).await;
+    }
     let archive = &build.archive;
-    let (mut roots, mut debs) = build.extra_packages()?;
+    let (mut roots, mut debs) = build.extra_packages().await?;
     let packages: Vec<String> = if !archive.contents.ros_package(name).is_empty() {
         vec![name.to_owned()]
     } else if archive.candidates.contains(name) {
@@ -71,6 +76,36 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     Ok(Parts {
         packages,
         version,
+        dependencies,
+        package: Made::default(),
+        prefix: None,
+    })
+}
+
+/// Of ROS 2, whose archive has one Debian package for each ROS package, with all that it needs.
+async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
+    let (archive, base) = (&build.archive, &build.base);
+    let own = format!("ros-{}-", base.ros_distribution);
+    let plain = name.strip_prefix(&own).unwrap_or(name).replace('-', "_");
+    let Some(deb) = keys::deb_of(archive, base, &plain) else {
+        return Err(Error::NotInRosArchive {
+            name: name.to_owned(),
+            base: base.name.clone(),
+            distribution: base.ros_distribution.clone(),
+        });
+    };
+    let (_, mut debs) = build.extra_packages().await?;
+    let version = archive.candidates.get(&deb);
+    debs.insert(deb);
+    let mapped = build.request.map.values();
+    let mapped = mapped.flat_map(|debs| debs.split([',', ' ']));
+    debs.extend(mapped.filter(|deb| !deb.is_empty()).map(str::to_owned));
+    let dependencies = build
+        .add("dependencies", &build.on_base(), &debs, Vec::new())
+        .await?;
+    Ok(Parts {
+        packages: vec![plain],
+        version: version.map_or_else(String::new, |deb| deb.version),
         dependencies,
         package: Made::default(),
         prefix: None,

@@ -1,14 +1,15 @@
 //! An install space that was compiled elsewhere: placed where it was compiled for.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use package::workspace::InstallSpace;
+use package::workspace::{InstallSpace, Layout};
 
 use crate::build::{Build, Parts};
 use crate::compile;
 use crate::error::{Error, IoAt};
+use crate::indexed::Indexed;
 use crate::install::{Made, set_mode};
 use crate::key::{self, Key};
 use crate::keys::{self, Needed};
@@ -20,19 +21,8 @@ const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/v
 
 /// Packs it and finds what it needs.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Parts, Error> {
-    // Without a prefix nothing in it cares where it is.
-    let prefix = space
-        .prefix
-        .clone()
-        .unwrap_or_else(|| build.base.build.prefix.clone());
     let packages = pushed::by_importance(&space.packages);
-    let usable = prefix.is_absolute() && prefix != Path::new("/");
-    if !usable || HIDDEN.iter().any(|hidden| prefix.starts_with(hidden)) {
-        return Err(Error::Prefix {
-            prefix,
-            package: packages.first().cloned().unwrap_or_default(),
-        });
-    }
+    let prefix = place(&space, &build.base.build.prefix, &packages)?;
     let (own, asked) = (
         pushed::names(&space.packages),
         pushed::asked(&space.packages),
@@ -42,13 +32,21 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
         build: BTreeMap::new(),
         ..asked
     };
+    let there = Indexed {
+        build: BTreeSet::new(),
+        run: build.indexed(&build.on_base()).await?,
+    };
     let resolved = keys::resolve(
         &build.archive,
         &build.base,
         &build.request.map,
         &own,
         &asked,
+        &there,
     )?;
+    for warning in &resolved.warnings {
+        build.progress.warn(warning.as_str()).await;
+    }
     let python = pushed::has_python(&space.root);
     let package = packed(build, &space, &prefix).await?;
     let needed = source::needed_by(build, &package).await?;
@@ -60,6 +58,24 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
         package,
         prefix: Some(prefix),
     })
+}
+
+/// Where it is put: where it was built for, if that can be seen. Without a prefix nothing in it cares where it is; scripts
+/// of ROS 2 can be told.
+fn place(space: &InstallSpace, otherwise: &Path, packages: &[String]) -> Result<PathBuf, Error> {
+    let Some(prefix) = &space.prefix else {
+        return Ok(otherwise.to_owned());
+    };
+    let is_usable = prefix.is_absolute() && prefix != Path::new("/");
+    let is_hidden = HIDDEN.iter().any(|hidden| prefix.starts_with(hidden));
+    match space.layout {
+        _ if is_usable && !is_hidden => Ok(prefix.clone()),
+        Layout::Merged | Layout::Isolated => Ok(otherwise.to_owned()),
+        Layout::Catkin => Err(Error::Prefix {
+            prefix: prefix.clone(),
+            package: packages.first().cloned().unwrap_or_default(),
+        }),
+    }
 }
 
 async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<Made, Error> {
@@ -103,4 +119,37 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         turn,
     };
     Ok(Made::one(shop.pack(packing, |_| Ok(())).await?, false))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_space_is_where_it_was_built_for_if_that_can_be_seen() {
+        let otherwise = Path::new("/opt/cloudroid/install");
+        let placed = |layout, prefix: Option<&str>| {
+            let space = InstallSpace {
+                root: PathBuf::new(),
+                layout,
+                prefix: prefix.map(PathBuf::from),
+                packages: Vec::new(),
+            };
+            place(&space, otherwise, &["p".to_owned()])
+        };
+        for layout in [Layout::Catkin, Layout::Merged, Layout::Isolated] {
+            let ours = Path::new("/home/me/ws/install");
+            assert_eq!(placed(layout, ours.to_str()).expect("can be seen"), ours);
+            assert_eq!(placed(layout, None).expect("anywhere"), otherwise);
+        }
+        for hidden in ["/root/ws/install", "/tmp/x", "/"] {
+            let text = placed(Layout::Catkin, Some(hidden))
+                .expect_err("cannot be seen")
+                .to_string();
+            assert!(text.contains("-DCMAKE_INSTALL_PREFIX=/opt/p"), "{text}");
+            for layout in [Layout::Merged, Layout::Isolated] {
+                assert_eq!(placed(layout, Some(hidden)).expect("elsewhere"), otherwise);
+            }
+        }
+    }
 }

@@ -8,6 +8,7 @@ use foreign::Visit;
 use package::condition::Variables;
 use package::manifest::Kind;
 use package::workspace::{self, Package, Pushed};
+use ros::bus::RosVersion;
 use rustix::fs::FileType;
 
 use crate::base::Base;
@@ -16,22 +17,29 @@ use crate::keys::Needed;
 
 /// Looks at a pushed tree.
 pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
-    let pushed = workspace::inspect(
-        root,
-        &Variables::ros(base.ros.bus().number(), &base.ros_distribution),
-    )?;
+    let version = base.ros.bus();
+    let variables = Variables::ros(version.number(), &base.ros_distribution);
+    let pushed = workspace::inspect(root, &variables)?;
     if let Pushed::Source(sources) = &pushed {
         for Package { manifest, .. } in &sources.packages {
-            if !matches!(manifest.build_type.as_str(), "catkin" | "cmake") {
+            if !manifest.fits(version) {
                 return Err(Error::BuildType {
                     package: manifest.name.clone(),
                     build_type: manifest.build_type.clone(),
                     base: base.name.clone(),
+                    builds: builds(version),
                 });
             }
         }
     }
     Ok(pushed)
+}
+
+fn builds(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "catkin and cmake",
+        RosVersion::Two => "ament_cmake, ament_python and cmake",
+    }
 }
 
 /// What its packages need from elsewhere.

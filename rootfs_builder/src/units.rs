@@ -19,6 +19,7 @@ use foreign::Visit;
 use image::Digest;
 use package::manifest::Kind;
 use package::workspace::{Package, Workspace};
+use ros::flavour::Version;
 use rustix::fs::FileType;
 
 use crate::build::Build;
@@ -195,7 +196,9 @@ fn needs(packages: &[Package]) -> Vec<Vec<usize>> {
         let named = package.manifest.needs(&NEEDS);
         let mut found = BTreeSet::new();
         for (earlier, other) in packages[..index].iter().enumerate() {
-            if named.contains(other.manifest.name.as_str()) {
+            if named.contains(other.manifest.name.as_str())
+                || package.manifest.needs_group_of(&other.manifest)
+            {
                 found.insert(earlier);
                 found.extend(&all[earlier]);
             }
@@ -327,7 +330,7 @@ impl Making<'_> {
         .await?)
     }
 
-    /// Configures all packages that are not compiled yet, on those that are.
+    /// Looks at all packages that are not compiled yet, on those that are: see [`Task::Check`].
     async fn check(&mut self, missing: &[usize], log: &mut Log) -> Result<(), Error> {
         let build = self.build;
         for index in 0..self.keys.len() {
@@ -335,9 +338,13 @@ impl Making<'_> {
                 self.diff_ids[index] = fetched(build, &self.keys[index]).await?;
             }
         }
+        let doing = match build.base.ros {
+            Version::Ros1 => "configuring",
+            Version::Ros2 => "looking at",
+        };
         build
             .progress
-            .step(&format!("configuring {} packages", missing.len()))
+            .step(&format!("{doing} {} packages", missing.len()))
             .await;
         let there: Vec<usize> = (0..self.keys.len()).collect();
         let place = |need: &usize| missing.iter().position(|index| index == need);

@@ -42,7 +42,7 @@ impl Catalogue {
             });
         }
         let inventory = Arc::new(self.inventory(revision).await?);
-        let registry = Registry::new();
+        let registry = Registry::of(revision.flavour.ros.bus());
         // The interface's own come last and win: they were compared with the running node.
         let texts = inventory.definitions.iter();
         for (key, text) in texts.chain(&revision.interface.definitions) {

@@ -25,12 +25,13 @@ const LONGEST_QUERY: usize = 60_000;
 
 /// Push a ROS package: build an image of it, find its interface, publish it as a service.
 ///
-/// PATH is a catkin package or workspace (compiled here), a prebuilt install space, or a tar archive of one.
+/// PATH is a package or workspace of ROS 1 (catkin) or ROS 2 (ament), which is compiled here, a prebuilt install space, or a
+/// tar archive of one.
 /// With --apt a packaged ROS package is taken instead.
 #[derive(Debug, Default, clap::Args)]
 #[command(group(clap::ArgGroup::new("what").required(true).args(["path", "apt"])))]
 pub struct Push {
-    /// A catkin package, workspace or install space, or a tar archive of one.
+    /// A ROS package, workspace or install space, or a tar archive of one.
     path: Option<PathBuf>,
     /// A packaged ROS package instead of a PATH, such as opencv_apps.
     #[arg(long, value_name = "NAME")]
@@ -38,15 +39,15 @@ pub struct Push {
     /// Name of the service; the package's by default.
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// Base image definition.
+    /// Base image definition; by default one that fits the ROS of the package.
     #[arg(long, value_name = "BASE")]
     base: Option<String>,
-    /// Launch file to run, as roslaunch finds it in the package.
+    /// Launch file to run, as roslaunch or ros2 launch finds it in the package.
     #[arg(long, value_name = "FILE", conflicts_with = "nodes")]
     launch: Option<String>,
     /// Executable to run (EXE, or PACKAGE/EXE), its arguments behind it in one pair of quotes: --node
-    /// 'topic_tools/relay /in /out'; may be given several times. The node has its program's own name, as under rosrun;
-    /// __name:=NAME gives it another.
+    /// 'topic_tools/relay /in /out'; may be given several times. The node has its program's own name, as under rosrun or
+    /// ros2 run; __name:=NAME (in ROS 2 __node:=NAME, too) gives it another.
     #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
     /// Private parameter of the nodes, or a global one (/K=V); may be given several times.

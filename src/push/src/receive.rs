@@ -211,6 +211,14 @@ fn refused(error: image::Error) -> Error {
             problem: Refusal::TooLarge { .. },
             ..
         } => Some("push less, or raise unpacked in [push] of the configuration".to_owned()),
+        image::Error::Archive {
+            problem: Refusal::LinkLeaves { .. },
+            ..
+        } => Some(
+            "replace the link with a copy; an install space made with 'colcon build --symlink-install' is full of them: \
+             build it without"
+                .to_owned(),
+        ),
         image::Error::Archive { .. } => Some(
             "push a tar archive of a package, workspace or install space that keeps to itself"
                 .to_owned(),

@@ -22,8 +22,8 @@ const CHUNKS_AHEAD: usize = 8;
 const DEPTH: usize = 6;
 /// Directories that hold nothing of a package.
 const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
-/// Beside `src` of a workspace: what catkin made of it.
-const MADE_BY_CATKIN: [&str; 5] = ["build", "devel", "install", "logs", "build_isolated"];
+/// Beside `src` of a workspace: what catkin or colcon made of it.
+const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
 
 /// The packing under way.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ pub fn of(path: &Path) -> anyhow::Result<(Body, Packing)> {
         std::fs::metadata(path).with_context(|| format!("cannot push {}", path.display()))?;
     if metadata.is_dir() && !holds_package(path, DEPTH)? {
         bail!(
-            "{} holds no package.xml; push the directory of a catkin package, a workspace or an install space, \
+            "{} holds no package.xml; push the directory of a ROS package, a workspace or an install space, \
              or take a packaged one with --apt NAME",
             path.display()
         );
@@ -134,7 +134,7 @@ fn add(
     for entry in entries {
         let name = entry.file_name();
         let left_out = LEFT_OUT.iter().any(|left_out| name == *left_out)
-            || (workspace && MADE_BY_CATKIN.iter().any(|made| name == *made));
+            || (workspace && MADE_OF_IT.iter().any(|made| name == *made));
         if left_out {
             continue;
         }

@@ -1,0 +1,142 @@
+//! Which ROS packages of ROS 2 are in layers already, as ament's index there says: what came with a base as wheels, or by
+//! apt, needs no list of ours.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use ros::flavour::Version;
+
+use crate::base::Base;
+use crate::blocking;
+use crate::error::Error;
+
+/// Packages that are there.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Indexed {
+    /// While compiling.
+    pub(crate) build: BTreeSet<String>,
+    /// At run time.
+    pub(crate) run: BTreeSet<String>,
+}
+
+/// Install spaces that a base has, absolute: as the environment names them that it gives to all processes, or to
+/// compilers. None where its ROS is not of ament.
+pub(crate) fn prefixes(base: &Base) -> Vec<String> {
+    if base.ros == Version::Ros1 {
+        return Vec::new();
+    }
+    let mut named: Vec<String> = Vec::new();
+    for environment in [&base.environment, &base.build.environment] {
+        for variable in ["AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"] {
+            let value = environment.get(variable).map_or("", String::as_str);
+            named.extend(value.split(':').map(str::to_owned));
+        }
+    }
+    named.push(format!("/opt/ros/{}", base.ros_distribution));
+    let mut seen = BTreeSet::new();
+    named.retain(|prefix| {
+        prefix.len() > 1 && prefix.starts_with('/') && seen.insert(prefix.clone())
+    });
+    named
+}
+
+/// Directories of shared libraries that a base's own programs find, below the root.
+pub(crate) fn libraries(base: &Base) -> Vec<String> {
+    let mut places: Vec<String> = prefixes(base)
+        .iter()
+        .map(|prefix| format!("{}/lib", prefix.trim_matches('/')))
+        .collect();
+    if base.ros != Version::Ros1 {
+        let given = base.environment.get("LD_LIBRARY_PATH");
+        let given = given.map_or("", String::as_str).split(':');
+        let given = given.map(|place| place.trim_matches('/'));
+        places.extend(given.filter(|place| !place.is_empty()).map(str::to_owned));
+    }
+    places
+}
+
+/// Packages in the index of these trees, lowest first.
+pub(crate) async fn packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
+    let prefixes = prefixes(base);
+    if prefixes.is_empty() {
+        return Ok(BTreeSet::new());
+    }
+    let look = move || package::ament::packages(&trees, &prefixes);
+    Ok(blocking::reading(look).await??)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeMap;
+    use std::path::Path;
+
+    fn base(ros: Version) -> Base {
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let mut base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
+        base.definition.ros = ros;
+        base.definition.ros_distribution = "jazzy".to_owned();
+        let variables = [
+            ("AMENT_PREFIX_PATH", "/opt/wheels:relative:"),
+            ("LD_LIBRARY_PATH", "/opt/wheels/lib:/opt/more"),
+        ];
+        base.definition.environment = variables
+            .map(|(name, value)| (name.to_owned(), value.to_owned()))
+            .into();
+        base.definition.build.environment = BTreeMap::from([(
+            "CMAKE_PREFIX_PATH".to_owned(),
+            "/opt/tools:/opt/wheels".to_owned(),
+        )]);
+        base
+    }
+
+    #[test]
+    fn spaces_are_those_that_the_base_names() {
+        let two = base(Version::Ros2);
+        assert_eq!(
+            prefixes(&two),
+            ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]
+        );
+        assert_eq!(
+            libraries(&two),
+            [
+                "opt/wheels/lib",
+                "opt/tools/lib",
+                "opt/ros/jazzy/lib",
+                "opt/wheels/lib",
+                "opt/more"
+            ]
+        );
+        let one = base(Version::Ros1);
+        assert!(prefixes(&one).is_empty() && libraries(&one).is_empty());
+    }
+
+    #[tokio::test]
+    async fn packages_are_found_by_looking() {
+        let tree = tempfile::tempdir().expect("a directory");
+        for (prefix, name) in [
+            ("opt/wheels", "rclpy"),
+            ("opt/ros/jazzy", "std_msgs"),
+            ("opt/elsewhere", "hidden"),
+        ] {
+            let index = tree
+                .path()
+                .join(prefix)
+                .join("share/ament_index/resource_index/packages");
+            std::fs::create_dir_all(&index).expect("made");
+            std::fs::write(index.join(name), "").expect("written");
+        }
+        let trees = vec![tree.path().to_owned()];
+        let found = packages(&base(Version::Ros2), trees.clone())
+            .await
+            .expect("read");
+        let names: Vec<&str> = found.iter().map(String::as_str).collect();
+        assert_eq!(names, ["rclpy", "std_msgs"]);
+        assert!(
+            packages(&base(Version::Ros1), trees)
+                .await
+                .expect("read")
+                .is_empty()
+        );
+    }
+}

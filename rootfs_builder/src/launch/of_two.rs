@@ -1,0 +1,329 @@
+//! The scripts for ROS 2, run as they are, with a directory in the place of a container's root.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::PathBuf;
+use std::process::Command;
+
+use super::*;
+
+/// What an image holds, and what is asked.
+struct Lab {
+    root: tempfile::TempDir,
+}
+
+impl Lab {
+    fn new() -> Self {
+        let lab = Self {
+            root: tempfile::tempdir().expect("a directory"),
+        };
+        lab.write("cloudroid/out/.keep", "", 0o644);
+        for (name, text) in scripts(Version::Ros2) {
+            let inside = format!("{}/cloudroid/", lab.root.path().display());
+            let text = text.replace("/cloudroid/", &inside);
+            lab.write(&format!("cloudroid/{name}"), &text, 0o644);
+        }
+        // The base has a package of its own.
+        lab.package("base", "turtle", &["swim"]);
+        lab
+    }
+
+    fn path(&self, path: &str) -> PathBuf {
+        self.root.path().join(path)
+    }
+
+    fn write(&self, path: &str, text: &str, mode: u32) {
+        let path = self.path(path);
+        fs::create_dir_all(path.parent().expect("below")).expect("made");
+        fs::write(&path, text).expect("written");
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("set");
+    }
+
+    /// An installed package with these programs.
+    fn package(&self, prefix: &str, name: &str, programs: &[&str]) {
+        let index = format!("{prefix}/share/ament_index/resource_index/packages/{name}");
+        self.write(&index, "", 0o644);
+        self.write(&format!("{prefix}/share/{name}/package.xml"), "", 0o644);
+        for program in programs {
+            self.write(
+                &format!("{prefix}/lib/{name}/{program}"),
+                "#!/bin/sh\n",
+                0o755,
+            );
+        }
+    }
+
+    fn ask(&self, ask: &Ask) -> Result<Answer, Error> {
+        let question = serde_json::to_string(ask).expect("JSON");
+        self.write("cloudroid/ask.json", &question, 0o644);
+        let (first, _) = scripts(Version::Ros2)[0];
+        let said = Command::new("/usr/bin/python3")
+            .arg(self.path("cloudroid").join(first))
+            .env_clear()
+            .env("PATH", "/usr/bin:/bin")
+            .env("AMENT_PREFIX_PATH", self.path("base"))
+            .env("HOME", self.root.path())
+            .output()
+            .expect("run");
+        assert!(said.status.success(), "{said:?}");
+        let text = fs::read(self.path("cloudroid/out/plan.json")).expect("a plan");
+        let answer = understand(&text, Version::Ros2)?;
+        plan::check(&answer)?;
+        Ok(answer)
+    }
+
+    fn of(&self, prefix: &str, nodes: &[&str]) -> Ask {
+        Ask {
+            packages: vec!["talk".to_owned()],
+            prefix: self.path(prefix).display().to_string(),
+            nodes: nodes.iter().map(|&node| node.to_owned()).collect(),
+            ..Ask::default()
+        }
+    }
+}
+
+fn argv(answer: &Answer, index: usize) -> Vec<&str> {
+    let words = answer.nodes[index].argv.iter().skip(1);
+    words.map(String::as_str).collect()
+}
+
+#[test]
+fn programs_of_an_installed_package_are_nodes() {
+    let lab = Lab::new();
+    lab.package("space", "talk", &["talker", "listener"]);
+    // What colcon writes there: the space is where it is told that it is.
+    lab.write(
+        "space/local_setup.sh",
+        "export AMENT_PREFIX_PATH=\"$COLCON_CURRENT_PREFIX:$AMENT_PREFIX_PATH\" HOOKED=1\n",
+        0o644,
+    );
+    let mut ask = lab.of("space", &["talker --loud", "talker", "turtle/swim"]);
+    ask.params = [
+        ("rate".to_owned(), serde_json::json!(2)),
+        ("/all".to_owned(), serde_json::json!("x")),
+    ]
+    .into();
+    ask.remaps = [("in".to_owned(), "out".to_owned())].into();
+    let answer = lab.ask(&ask).expect("a plan");
+    let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
+    assert_eq!(names, ["/talker", "/talker_2", "/swim"]);
+    let talker = &answer.nodes[0];
+    assert_eq!(
+        talker.argv[0],
+        lab.path("space/lib/talk/talker").display().to_string()
+    );
+    // The program names itself, but for the second of one program.
+    assert_eq!(
+        answer
+            .nodes
+            .iter()
+            .map(|node| node.named)
+            .collect::<Vec<_>>(),
+        [false, true, false]
+    );
+    let remapped = ["--ros-args", "-r", "in:=out", "--"];
+    assert_eq!(argv(&answer, 0), [&["--loud"][..], &remapped].concat());
+    let named = ["--ros-args", "-r", "__node:=talker_2"];
+    assert_eq!(argv(&answer, 1), [&named[..], &remapped].concat());
+    assert_eq!(answer.nodes[2].package, "turtle");
+    let keys: Vec<&str> = answer.parameters.keys().map(String::as_str).collect();
+    assert_eq!(
+        keys,
+        ["/all", "/swim/rate", "/talker/rate", "/talker_2/rate"]
+    );
+    let (space, base) = (lab.path("space"), lab.path("base"));
+    let both = format!("{}:{}", space.display(), base.display());
+    assert_eq!(answer.environment["AMENT_PREFIX_PATH"], both);
+    assert_eq!(answer.environment["HOOKED"], "1");
+    for name in [
+        "COLCON_CURRENT_PREFIX",
+        "AMENT_CURRENT_PREFIX",
+        "PWD",
+        "HOME",
+    ] {
+        assert!(!answer.environment.contains_key(name), "{name}");
+    }
+}
+
+#[test]
+fn a_space_without_scripts_gets_what_it_needs() {
+    let lab = Lab::new();
+    for (prefix, name, programs) in [
+        ("space/talk", "talk", &["talker"][..]),
+        ("space/msgs", "msgs", &[]),
+    ] {
+        lab.package(prefix, name, programs);
+        lab.write(
+            &format!("{prefix}/lib/python3/dist-packages/{name}/__init__.py"),
+            "",
+            0o644,
+        );
+    }
+    // One program, so it is the one that is meant.
+    let answer = lab.ask(&lab.of("space", &[])).expect("a plan");
+    assert_eq!(answer.nodes[0].name, "/talker");
+    for (variable, below) in [
+        ("AMENT_PREFIX_PATH", ""),
+        ("CMAKE_PREFIX_PATH", ""),
+        ("LD_LIBRARY_PATH", "/lib"),
+        ("PYTHONPATH", "/lib/python3/dist-packages"),
+    ] {
+        for name in ["talk", "msgs"] {
+            let path = format!("{}{below}", lab.path("space").join(name).display());
+            let value = &answer.environment[variable];
+            assert!(
+                value.split(':').any(|part| part == path),
+                "{variable}={value}"
+            );
+        }
+    }
+}
+
+#[test]
+fn nodes_are_named_as_on_either_command_line() {
+    let lab = Lab::new();
+    lab.package("space", "talk", &["talker"]);
+    let asked = [
+        "talker __name:=one",
+        "talker --loud __node:=two __ns:=/below",
+        "talker --ros-args -r __node:=three -p rate:=1",
+    ];
+    let answer = lab.ask(&lab.of("space", &asked)).expect("a plan");
+    let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
+    assert_eq!(names, ["/one", "/below/two", "/three"]);
+    assert!(answer.nodes.iter().all(|node| node.named));
+    assert_eq!(argv(&answer, 0), ["--ros-args", "-r", "__name:=one"]);
+    let words = [
+        "--loud",
+        "--ros-args",
+        "-r",
+        "__node:=two",
+        "-r",
+        "__ns:=/below",
+    ];
+    assert_eq!(argv(&answer, 1), words);
+    let words = ["--ros-args", "-r", "__node:=three", "-p", "rate:=1"];
+    assert_eq!(argv(&answer, 2), words);
+}
+
+#[test]
+fn what_cannot_be_run_is_told_with_what_there_is() {
+    let lab = Lab::new();
+    lab.package("space", "talk", &["talker", "listener"]);
+    lab.write("space/share/talk/launch/both.launch.py", "", 0o644);
+    lab.write("space/share/talk/config/all.yaml", "", 0o644);
+    let refused = |ask: &Ask| lab.ask(ask).expect_err("refused").to_string();
+    let text = refused(&lab.of("space", &[]));
+    assert!(
+        text.contains("executables: listener, talker; launch files: launch/both.launch.py"),
+        "{text}"
+    );
+    let text = refused(&lab.of("space", &["walker"]));
+    assert!(
+        text.contains("no executable \"walker\"") && text.contains("listener, talker"),
+        "{text}"
+    );
+    let mut ask = lab.of("space", &[]);
+    ask.launch = "none.launch.py".to_owned();
+    let text = refused(&ask);
+    assert!(
+        text.contains("no launch file \"none.launch.py\"") && text.contains("both.launch.py"),
+        "{text}"
+    );
+    // This Python has no launch, as the base of wheels has none.
+    ask.launch = "both.launch.py".to_owned();
+    let text = refused(&ask);
+    assert!(
+        text.contains("no Python package launch") && text.contains("--node"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_space_for_another_python_is_refused() {
+    let lab = Lab::new();
+    lab.package("space", "talk", &["talker"]);
+    lab.write(
+        "space/lib/python3.2/site-packages/talk/__init__.py",
+        "",
+        0o644,
+    );
+    let text = lab
+        .ask(&lab.of("space", &["talker"]))
+        .expect_err("another")
+        .to_string();
+    assert!(
+        text.contains("made for python3.2, and the base has python3."),
+        "{text}"
+    );
+    lab.write("space/local_setup.sh", "return 3\n", 0o644);
+    fs::remove_dir_all(lab.path("space/lib/python3.2")).expect("removed");
+    let text = lab
+        .ask(&lab.of("space", &["talker"]))
+        .expect_err("it fails")
+        .to_string();
+    assert!(text.contains("ended with status 3"), "{text}");
+}
+
+/// What an expression of the second script's module is.
+fn evaluated(lab: &Lab, expression: &str) -> String {
+    let code = format!("from ros2_launch_plan import *; print({expression})");
+    let said = Command::new("/usr/bin/python3")
+        .args(["-c", &code])
+        .current_dir(lab.path("cloudroid"))
+        .output()
+        .expect("run");
+    assert!(said.status.success(), "{said:?}");
+    String::from_utf8_lossy(&said.stdout).trim().to_owned()
+}
+
+#[test]
+fn parameters_of_launch_files_keep_their_types() {
+    let lab = Lab::new();
+    for (value, expected) in [
+        ("True", "true"),
+        ("7", "7"),
+        ("2.0", "2.0"),
+        ("1e300", "1.0e+300"),
+        ("float('inf')", ".inf"),
+        ("'10'", "\"10\""),
+        ("'a\\n\"b\"'", "\"a\\n\\\"b\\\"\""),
+        ("[1.5, 2.0]", "[1.5, 2.0]"),
+        ("['a', 'b']", "[\"a\", \"b\"]"),
+        ("[]", "[]"),
+    ] {
+        assert_eq!(
+            evaluated(&lab, &format!("written({value})")),
+            expected,
+            "{value}"
+        );
+    }
+    let nested = "sorted(flattened({'a': {'b': 1, 'c': {'d': 2}}, 'e': 3}, '').items())";
+    assert_eq!(
+        evaluated(&lab, nested),
+        "[('a.b', 1), ('a.c.d', 2), ('e', 3)]"
+    );
+}
+
+#[test]
+fn sections_of_parameter_files_apply_by_name() {
+    let lab = Lab::new();
+    for (pattern, node, expected) in [
+        ("/**", "'/a/b'", "True"),
+        ("/**", "None", "True"),
+        ("/a/b", "'/a/b'", "True"),
+        ("a/b", "'/a/b'", "True"),
+        ("/a/*", "'/a/b'", "True"),
+        ("/*", "'/a/b'", "False"),
+        ("/a/b", "'/b'", "False"),
+        ("/a/b", "None", "False"),
+        ("/**/b", "'/a/c/b'", "True"),
+    ] {
+        let expression = format!("applies('{pattern}', {node})");
+        assert_eq!(evaluated(&lab, &expression), expected, "{pattern} {node}");
+    }
+    let tree = "{'/ns': {'n': {'ros__parameters': {'k': 1}}}, '/**': {'ros__parameters': None}}";
+    assert_eq!(
+        evaluated(&lab, &format!("list(sections({tree}, ''))")),
+        "[('/ns/n', {'k': 1}), ('/**', {})]"
+    );
+}
