@@ -12,6 +12,7 @@ pub mod codec;
 pub mod ros;
 pub mod ros2;
 pub mod rosbridge;
+pub mod rtps;
 
 /// What takes the fuzzer's bytes.
 pub type Target = fn(&[u8]);
@@ -43,6 +44,8 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("ros2_cbor", ros2::cbor),
     ("ros2_bytes", ros2::bytes),
     ("ros2_definition", ros2::definition),
+    ("rtps_datagram", rtps::datagram),
+    ("rtps_discovery", rtps::discovery),
     ("ros_tcpros", ros::tcpros),
     ("ros_xmlrpc", ros::xmlrpc),
 ];

@@ -1,5 +1,7 @@
 //! What participants tell of themselves and of their ends (8.5), as data.
 
+#![forbid(unsafe_code)]
+
 mod endpoint;
 mod key;
 mod participant;

@@ -7,6 +7,8 @@
 //!        └─▶ writers ─▶ Wanted ─▶ paths: one for each address ─▶ transmit
 //! ```
 
+#![forbid(unsafe_code)]
+
 mod discovering;
 mod ends;
 mod incoming;

@@ -3,6 +3,8 @@
 //! A datagram is a header and submessages. Those that only tell about the ones after them (who sends, to whom, when) are
 //! carried out here: what is given on is a [`Received`] for each of the others. Payloads are slices of the datagram.
 
+#![forbid(unsafe_code)]
+
 #[cfg(test)]
 mod captured;
 mod input;

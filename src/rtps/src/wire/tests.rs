@@ -226,6 +226,12 @@ fn fragments_are_exactly_their_bytes() {
         frag("00000000", "66676869 6a000000").fault,
         Some(WireError::Fragments { first: 0, .. })
     ));
+    // One that would begin where the sample ends has nothing.
+    let behind = "1601 2400 0000 1c00 00000504 00000403 00000000 07000000 03000000 0100 0800 10000000 66676869";
+    assert!(matches!(
+        said(behind).fault,
+        Some(WireError::Fragments { first: 3, .. })
+    ));
     let short = "1601 2400 0000 1c00 00000504 00000403 00000000 07000000 01000000 0100 0800 0d000000 66676869";
     assert_eq!(said(short).fault, Some(WireError::Short));
 }
@@ -287,6 +293,13 @@ fn a_fault_ends_the_datagram() {
             "0601 3c00 {ends} 00000000 01000000 01010000 {words} 01000000"
         )),
         Some(WireError::Set(257))
+    );
+    // So far up that what is added to it would not be a number any more.
+    assert_eq!(
+        fault(&format!(
+            "0701 1c00 {ends} 00000000 01000000 00000040 00000000 03000000"
+        )),
+        Some(WireError::Number(1 << 62))
     );
     assert_eq!(
         fault(&format!(

@@ -1,0 +1,3 @@
+//! A datagram of RTPS.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(rtps, datagram);

@@ -1,0 +1,101 @@
+//! Datagrams of RTPS, and what participants tell in them of themselves and of their ends.
+
+use std::fmt::Debug;
+
+use ::rtps::wire::{
+    self, Data, DatagramWriter, ParticipantMessage, Received, Submessage, WireError,
+};
+use ::rtps::{EndpointData, ParticipantData};
+use bytes::Bytes;
+
+/// A datagram. What is read of it is written again, one submessage for each datagram, and read as the same.
+pub fn datagram(data: &[u8]) {
+    let datagram = Bytes::copy_from_slice(data);
+    let parsed = wire::parse(&datagram);
+    assert!(parsed.received.len() <= wire::MOST_SUBMESSAGES);
+    let payloads: usize = parsed.received.iter().map(length).sum();
+    assert!(
+        payloads <= data.len(),
+        "payloads that are not of the datagram"
+    );
+    for received in parsed.received {
+        let again = wire::parse(&written(&received).into());
+        assert_eq!(again.fault, None, "{received:?}");
+        let [again] = <[Received; 1]>::try_from(again.received).expect("one");
+        assert_eq!((again.to, again.written), (received.to, received.written));
+        assert_eq!(again.submessage, filled(received.submessage));
+    }
+}
+
+/// The payload of a sample of discovery. What is read of it is written and read as the same.
+pub fn discovery(data: &[u8]) {
+    let payload = Bytes::copy_from_slice(data);
+    comes_back(
+        &payload,
+        ParticipantData::from_payload,
+        ParticipantData::to_bytes,
+    );
+    comes_back(&payload, EndpointData::from_payload, EndpointData::to_bytes);
+    comes_back(
+        &payload,
+        ParticipantMessage::from_payload,
+        ParticipantMessage::to_bytes,
+    );
+}
+
+/// Above this some of what was read can be too long for a parameter when it is written.
+const MOST: usize = 16 << 10;
+
+fn comes_back<T: PartialEq + Debug>(
+    payload: &Bytes,
+    read: fn(&Bytes) -> Result<T, WireError>,
+    write: fn(&T) -> Bytes,
+) {
+    match read(payload) {
+        Ok(told) if payload.len() <= MOST => assert_eq!(read(&write(&told)), Ok(told)),
+        Ok(_) => {}
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+}
+
+fn length(received: &Received) -> usize {
+    match &received.submessage {
+        Submessage::Data(data) => data.payload.as_ref().map_or(0, Bytes::len),
+        Submessage::DataFrag(frag) => frag.payload.len(),
+        _ => 0,
+    }
+}
+
+fn written(received: &Received) -> Vec<u8> {
+    let mut writer = DatagramWriter::new(received.from);
+    if let Some(to) = received.to {
+        writer.destination(to);
+    }
+    if let Some(time) = received.written {
+        writer.timestamp(time);
+    }
+    match &received.submessage {
+        Submessage::Data(data) => writer.data(data),
+        Submessage::DataFrag(frag) => writer.data_frag(frag),
+        Submessage::Heartbeat(beat) => writer.heartbeat(beat),
+        Submessage::HeartbeatFrag(beat) => writer.heartbeat_frag(beat),
+        Submessage::AckNack(acknack) => writer.acknack(acknack),
+        Submessage::NackFrag(nack) => writer.nack_frag(nack),
+        Submessage::Gap(gap) => writer.gap(gap),
+    };
+    writer.finish()
+}
+
+/// The payload of a sample is filled up to a multiple of four bytes when it is written.
+fn filled(mut submessage: Submessage) -> Submessage {
+    if let Submessage::Data(Data {
+        payload: Some(payload),
+        ..
+    }) = &mut submessage
+    {
+        let mut bytes = payload.to_vec();
+        bytes.resize(bytes.len().next_multiple_of(4), 0);
+        *payload = bytes.into();
+    }
+    submessage
+}
