@@ -1,5 +1,9 @@
-//! A ROS system in memory, of another kind than ROS 1: ends are matched by type and quality of service, actions are its
-//! own, and there are neither global parameters nor services of other systems. Whoever uses a bus must not notice.
+//! A ROS system in memory that behaves as ROS 2 does: ends are matched by type and quality of service, definitions do not
+//! travel, actions are its own, parameters belong to nodes, and there are no services of other systems. Whoever uses a bus
+//! must not notice.
+
+#[path = "memory_bus/parameters.rs"]
+mod parameters;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -10,9 +14,9 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
-    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, Outcome, Peer, PeerId, Publisher,
-    Qos, RosVersion, ServiceHandler, ServiceType, Subscription, TopicNodes, WireType,
-    message_queue,
+    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, NodeParameters, Outcome,
+    ParamValue, Peer, PeerId, Publisher, Qos, Refusal, RosVersion, ServiceHandler, ServiceType,
+    Subscription, TopicNodes, WireFormat, WireType, message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
@@ -29,6 +33,8 @@ pub struct MemorySystem {
 struct State {
     numbers: u128,
     nodes: BTreeSet<String>,
+    /// Node → its parameters.
+    parameters: BTreeMap<String, BTreeMap<String, ParamValue>>,
     topics: BTreeMap<String, Topic>,
     services: BTreeMap<String, Service>,
     actions: BTreeMap<String, Action>,
@@ -53,6 +59,8 @@ struct Publication {
 struct Listener {
     id: PeerId,
     of: WireType,
+    /// What publishers must offer; of a bus it is a wish, of other nodes it is not.
+    demanded: Option<Qos>,
     messages: MessageSender,
     matched: watch::Sender<Matched>,
 }
@@ -75,9 +83,37 @@ struct Action {
 }
 
 impl Publication {
-    /// What of this end's goes to that one. What a node publishes itself is not brought back to it.
+    /// What a node publishes itself is not brought back to it.
+    fn is_beside(&self, listener: &Listener) -> bool {
+        self.id.node() != listener.id.node()
+    }
+
+    fn is_of_type(&self, listener: &Listener) -> bool {
+        let named = listener.of.name == "*" || listener.of.name == self.of.name;
+        named && self.of.agrees(&listener.of)
+    }
+
+    /// What a listener demands that is not offered.
+    fn lacks(&self, listener: &Listener) -> Option<String> {
+        let demanded = listener.demanded.filter(Qos::is_latching)?;
+        let offers_less = demanded.durability != self.qos.durability;
+        offers_less.then(|| {
+            "durability: the publisher offers volatile, the subscriber asks for transient_local"
+                .to_owned()
+        })
+    }
+
+    /// Why nothing passes to that listener, from the side of one of both.
+    fn refuses(&self, listener: &Listener, theirs: &WireType, ours: &WireType) -> Option<String> {
+        match self.is_of_type(listener) {
+            true => self.lacks(listener),
+            false => Some(format!("its type is {theirs} there and {ours} here")),
+        }
+    }
+
+    /// What of this end's goes to that one.
     fn reaches(&self, listener: &Listener) -> bool {
-        self.id.node() != listener.id.node() && self.of.agrees(&listener.of)
+        self.is_beside(listener) && self.is_of_type(listener) && self.lacks(listener).is_none()
     }
 
     fn message(&self, bytes: Bytes) -> Message {
@@ -93,33 +129,37 @@ impl Publication {
 impl Topic {
     /// Tells all ends who is at the other.
     fn show(&self) {
-        let peers = |ids: Vec<&PeerId>| Matched {
-            peers: ids
-                .into_iter()
-                .map(|id| Peer {
-                    id: id.clone(),
-                    connected: true,
-                    offer: None,
-                })
-                .collect(),
-            refused: Vec::new(),
-        };
         let tell = |end: &watch::Sender<Matched>, now: Matched| {
             end.send_if_modified(|before| std::mem::replace(before, now.clone()) != now);
         };
+        let add = |matched: &mut Matched, id: &PeerId, refusal: Option<String>| match refusal {
+            None => matched.peers.push(Peer {
+                id: id.clone(),
+                connected: true,
+                offer: None,
+            }),
+            Some(why) => matched.refused.push(Refusal {
+                peer: id.clone(),
+                why,
+            }),
+        };
         for publisher in &self.publishers {
-            let others = self
-                .subscribers
-                .iter()
-                .filter(|other| publisher.reaches(other));
-            tell(&publisher.matched, peers(others.map(|it| &it.id).collect()));
+            let mut now = Matched::default();
+            let others = self.subscribers.iter();
+            for other in others.filter(|other| publisher.is_beside(other)) {
+                let refusal = publisher.refuses(other, &other.of, &publisher.of);
+                add(&mut now, &other.id, refusal);
+            }
+            tell(&publisher.matched, now);
         }
         for listener in &self.subscribers {
-            let others = self
-                .publishers
-                .iter()
-                .filter(|other| other.reaches(listener));
-            tell(&listener.matched, peers(others.map(|it| &it.id).collect()));
+            let mut now = Matched::default();
+            let others = self.publishers.iter();
+            for other in others.filter(|other| other.is_beside(listener)) {
+                let refusal = other.refuses(listener, &other.of, &listener.of);
+                add(&mut now, &other.id, refusal);
+            }
+            tell(&listener.matched, now);
         }
     }
 }
@@ -155,13 +195,14 @@ impl State {
             (name.clone(), nodes)
         });
         let services = self.services.iter();
+        let services = services.map(|(name, it)| (name.clone(), it.node.clone()));
+        let lists = self.parameters.keys();
+        let lists = lists.map(|node| (format!("{node}/list_parameters"), node.clone()));
         let nodes = self.nodes.iter();
         Graph {
             generation,
             topics: topics.collect(),
-            services: services
-                .map(|(name, it)| (name.clone(), it.node.clone()))
-                .collect(),
+            services: services.chain(lists).collect(),
             actions: actions.collect(),
             nodes: nodes
                 .map(|name| (name.clone(), "memory".to_owned()))
@@ -178,6 +219,18 @@ impl MemorySystem {
         Arc::new(MemoryBus {
             system: self.clone(),
             node: node.to_owned(),
+            demands: false,
+        })
+    }
+
+    /// A node that hears those publishers alone that offer what it asks for.
+    #[allow(dead_code, reason = "who includes this file need not have such nodes")]
+    pub fn join_demanding(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
+        self.change(|state| state.nodes.insert(node.to_owned()));
+        Arc::new(MemoryBus {
+            system: self.clone(),
+            node: node.to_owned(),
+            demands: true,
         })
     }
 
@@ -203,12 +256,17 @@ impl MemorySystem {
 pub struct MemoryBus {
     system: Arc<MemorySystem>,
     node: String,
+    /// What it asks of publishers is no wish.
+    demands: bool,
 }
 
 impl Drop for MemoryBus {
     fn drop(&mut self) {
         let node = &self.node;
-        self.system.change(|state| state.nodes.remove(node));
+        self.system.change(|state| {
+            state.parameters.remove(node);
+            state.nodes.remove(node)
+        });
     }
 }
 
@@ -300,6 +358,7 @@ impl Bus for MemoryBus {
             let listener = Listener {
                 id: id.clone(),
                 of,
+                demanded: self.demands.then_some(qos),
                 messages: sender,
                 matched: end,
             };
@@ -340,7 +399,10 @@ impl Bus for MemoryBus {
             topic.changed = true;
             topic.publishers.push(Publication {
                 id: id.clone(),
-                of: Arc::new(of),
+                of: Arc::new(WireType {
+                    definition: String::new(),
+                    ..of
+                }),
                 qos,
                 last: None,
                 matched: end,
@@ -402,7 +464,10 @@ impl Bus for MemoryBus {
         let publishers = known.publishers.iter().map(|it| WireType::clone(&it.of));
         let mut types = publishers.chain(known.subscribers.iter().map(|it| it.of.clone()));
         let told = types.find(|of| !of.digest.is_any());
-        Ok(told.unwrap_or_else(WireType::any))
+        Ok(told.unwrap_or_else(|| WireType {
+            format: WireFormat::Cdr,
+            ..WireType::any()
+        }))
     }
 
     async fn serve(
@@ -475,6 +540,10 @@ impl Bus for MemoryBus {
             action: action.to_owned(),
             number,
         }))
+    }
+
+    fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        Ok(self)
     }
 }
 

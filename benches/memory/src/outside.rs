@@ -84,6 +84,7 @@ fn publish(robot: &mut Robot, topic: &str, elements: usize, element: i8) -> Resu
         compression: Compression::CborRaw,
         latch: false,
         type_name: None,
+        qos: None,
     });
     let mut out = Vec::new();
     op.print(&mut out, Format::Cbor);

@@ -2,6 +2,7 @@
 
 mod actions;
 mod calls;
+mod decoding;
 mod inbox;
 mod publishing;
 mod serving;
@@ -9,6 +10,7 @@ mod subscribing;
 mod under_way;
 mod withdrawn;
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
@@ -16,14 +18,17 @@ use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
 use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
+use ros::bus::RosVersion;
 use ros::schema::MessageType;
 use rosbridge::{
-    Compression, Error, Format, Frame as Incoming, GoalStatus, Id, Level, Op, Payload, Status,
+    Compression, Error, Format, Frame as Incoming, GoalStatus, Id, Level, Op, Payload, Qos, Status,
     Writer,
 };
 use tokio_util::sync::CancellationToken;
 
+use crate::names;
 use crate::outbox::{Control, Goodbye, Outbox};
+use crate::quality::unheard;
 use crate::sample::Frame;
 use crate::shared::Shared;
 use crate::{Granted, SessionOptions};
@@ -74,6 +79,16 @@ pub(crate) struct Reply {
 }
 
 impl Client {
+    /// Which ROS its servant speaks.
+    fn version(&self) -> RosVersion {
+        self.shared.bus.version()
+    }
+
+    /// The absolute form of a name that it has written.
+    fn resolve<'n>(&self, name: &'n str) -> Result<Cow<'n, str>, String> {
+        names::resolve(self.version(), name)
+    }
+
     /// What it may do.
     pub(crate) fn granted(&self) -> Granted {
         self.granted.lock().clone()
@@ -111,10 +126,14 @@ impl Client {
     pub(crate) fn end(&self) {
         self.ended.cancel();
         // Dropped outside of the locks: what is dropped may want them.
-        drop(std::mem::take(&mut *self.subscriptions.lock()));
-        drop(std::mem::take(&mut *self.topic_publishers.lock()));
-        drop(std::mem::take(&mut *self.services.lock()));
-        drop(std::mem::take(&mut *self.actions.lock()));
+        let subscriptions = std::mem::take(&mut *self.subscriptions.lock());
+        drop(subscriptions);
+        let topic_publishers = std::mem::take(&mut *self.topic_publishers.lock());
+        drop(topic_publishers);
+        let services = std::mem::take(&mut *self.services.lock());
+        drop(services);
+        let actions = std::mem::take(&mut *self.actions.lock());
+        drop(actions);
     }
 
     /// Whether another socket may take over.
@@ -349,6 +368,14 @@ impl Client {
         match wrapped {
             Ok(frame) => self.send_frame(frame, fragment_size, true),
             Err(reason) => self.status(Level::Error, None, Format::Json, &reason),
+        }
+    }
+
+    /// Warns of policies in `qos` that mean nothing here.
+    fn report_unheard(&self, op: &str, qos: Option<Qos>, subscribes: bool, reply: &Reply) {
+        let unheard = qos.and_then(|qos| unheard(self.version(), &qos, subscribes));
+        if let Some(unheard) = unheard {
+            self.warn(reply, &format!("{op}: {unheard}"));
         }
     }
 

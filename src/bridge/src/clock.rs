@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros::bus::ParamValue;
+use ros::bus::{ParamValue, RosVersion};
 use ros::codec::{Stamps, Time};
 use tokio::sync::mpsc;
 
@@ -13,6 +13,8 @@ use crate::shared::Shared;
 
 /// How long a simulation may keep silent before the wall's time must do.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// Where a simulation tells the time.
+const CLOCK: &str = "/clock";
 
 struct Ticks(mpsc::UnboundedSender<Time>);
 
@@ -28,11 +30,26 @@ impl Listener for Ticks {
     fn failed(&self, _reason: &str) {}
 }
 
+/// Whether time is simulated. In ROS 2 each node decides that for itself: it is as soon as one of them publishes the time.
+async fn is_simulated(shared: &Shared) -> bool {
+    match shared.bus.version() {
+        RosVersion::One => {
+            let said = shared.bus.parameter("/use_sim_time").await;
+            matches!(said, Ok(ParamValue::Bool(true)))
+        }
+        RosVersion::Two => {
+            let graph = shared.bus.graph().borrow().clone();
+            let nodes = graph.topics.get(CLOCK);
+            nodes.is_some_and(|nodes| !nodes.publishers.is_empty())
+        }
+    }
+}
+
 /// The time now.
 pub(crate) async fn now(shared: &Arc<Shared>) -> Time {
-    if let Ok(ParamValue::Bool(true)) = shared.bus.parameter("/use_sim_time").await {
+    if is_simulated(shared).await {
         let (ticks, mut heard) = mpsc::unbounded_channel();
-        let listening = shared.fanout("/clock", None).listen(Arc::new(Ticks(ticks)));
+        let listening = shared.fanout(CLOCK, None).listen(Arc::new(Ticks(ticks)));
         let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;
         drop(listening);
         if let Ok(Some(time)) = tick {

@@ -5,11 +5,14 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::Instant;
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Message, PeerId, Qos, Subscription, WireType};
+use ros::bus::{Bus, Matched, Message, PeerId, Qos, Subscription, WireType};
 use ros::schema::MessageType;
 use tokio::task::AbortHandle;
 
 use crate::Metrics;
+use crate::names::any_definition;
+use crate::quality::all_there_is;
+use crate::refusals::Refusals;
 use crate::sample::{Sample, TopicTypes};
 use crate::shared::{Heard, Shared};
 use crate::topic_requests::TopicRequests;
@@ -20,11 +23,15 @@ pub(crate) trait Listener: Send + Sync {
     fn sample(&self, sample: &Arc<Sample>, replay: bool);
     /// The topic cannot be subscribed to.
     fn failed(&self, reason: &str);
+    /// A publisher of the topic is not heard, because it offers something else. Told once of each.
+    fn refused(&self, _reason: &str) {}
 }
 
-/// The one subscription.
+/// The one subscription for all who ask the same of the topic's publishers.
 pub(crate) struct Fanout {
     pub(crate) topic: String,
+    /// What is asked of them.
+    qos: Qos,
     shared: Weak<Shared>,
     types: Arc<TopicTypes>,
     /// What its messages answer, if anything.
@@ -41,6 +48,8 @@ struct State {
     listeners: Arc<Listeners>,
     /// The last message of every latching publisher.
     latched: Vec<Arc<Sample>>,
+    /// Publishers that are not heard.
+    refusals: Refusals,
     failed: Option<String>,
 }
 
@@ -79,9 +88,11 @@ impl Fanout {
         shared: &Arc<Shared>,
         topic: &str,
         message_type: Option<&MessageType>,
+        qos: Qos,
     ) -> Arc<Fanout> {
         let fanout = Arc::new(Fanout {
             topic: topic.to_owned(),
+            qos,
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
             answers: shared.answers_on(topic),
@@ -91,8 +102,8 @@ impl Fanout {
         });
         // Any digest: a publisher with another definition is read by its own, or its listeners are told of it; a
         // connection refused for it would only be silence.
-        let of = message_type.map_or_else(WireType::any, |found| WireType::named(found.name()));
-        let qos = Qos::keep_last(shared.options.bus_queue).latching(true);
+        let name = message_type.map_or("*", MessageType::name);
+        let of = any_definition(shared.bus.version(), name);
         let pump = tokio::spawn(pump(
             Arc::downgrade(&fanout),
             shared.bus.clone(),
@@ -109,6 +120,7 @@ impl Fanout {
     pub(crate) fn internal(shared: &Arc<Shared>, topic: &str) -> Arc<Fanout> {
         Arc::new(Fanout {
             topic: topic.to_owned(),
+            qos: all_there_is(shared.options.bus_queue),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
             answers: None,
@@ -128,6 +140,16 @@ impl Fanout {
         self.pump.get().is_none()
     }
 
+    /// Whether it asks this of the topic's publishers, or has none of nodes.
+    pub(crate) fn serves(&self, qos: &Qos) -> bool {
+        self.is_internal() || self.qos == *qos
+    }
+
+    /// Whether newcomers are given what was published before.
+    pub(crate) fn keeps(&self) -> bool {
+        self.qos.is_latching()
+    }
+
     /// Adds a listener, which first hears what latching publishers last said.
     pub(crate) fn listen(self: &Arc<Self>, listener: Arc<dyn Listener>) -> Listening {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
@@ -135,6 +157,9 @@ impl Fanout {
         let mut state = self.state.lock();
         if let Some(reason) = &state.failed {
             listener.failed(reason);
+        }
+        for reason in state.refusals.known() {
+            listener.refused(reason);
         }
         self.replay_to(&mut state, listener.as_ref());
         let mut listeners = Listeners::clone(&state.listeners);
@@ -190,7 +215,7 @@ impl Fanout {
         };
         let listeners = {
             let mut state = self.state.lock();
-            if sample.latching {
+            if sample.latching && self.keeps() {
                 state
                     .latched
                     .retain(|other| other.publisher != sample.publisher);
@@ -220,6 +245,20 @@ impl Fanout {
         let took = of.and_then(|of| requests.answered(&of, &message.bytes, Instant::now()));
         if let (Some(took), Some(shared)) = (took, self.shared.upgrade()) {
             shared.options.called.tell(Some(took));
+        }
+    }
+
+    /// Tells all listeners of publishers that are not heard.
+    fn note_refused(&self, matched: &Matched) {
+        let (new, listeners) = {
+            let mut state = self.state.lock();
+            let new = state.refusals.update(matched);
+            (new, state.listeners.clone())
+        };
+        for reason in &new {
+            for (_, listener) in listeners.iter() {
+                listener.refused(reason);
+            }
         }
     }
 
@@ -270,9 +309,28 @@ async fn pump(
     let own = bus.node().to_owned();
     drop(bus);
     let mut dropped = 0;
-    while let Some(message) = subscription.messages.recv().await {
+    let mut matched = subscription.matched.clone();
+    // Those that are there already.
+    matched.mark_changed();
+    let mut watched = true;
+    loop {
+        let next = tokio::select! {
+            next = subscription.messages.recv() => match next {
+                Some(message) => Some(message),
+                None => return,
+            },
+            changed = matched.changed(), if watched => {
+                watched = changed.is_ok();
+                None
+            }
+        };
         let Some(fanout) = fanout.upgrade() else {
             return;
+        };
+        let Some(message) = next else {
+            let now = matched.borrow_and_update().clone();
+            fanout.note_refused(&now);
+            continue;
         };
         metrics.received.add(1);
         // From an action of another client.

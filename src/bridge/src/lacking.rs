@@ -1,8 +1,9 @@
 //! What clients are told of a definition that cannot be had.
 
+use ros::bus::RosVersion;
 use ros::schema::SchemaError;
 
-/// Debian's packages of message definitions, without their `ros-` and with ROS's underscores.
+/// Debian's packages of message definitions of ROS 1, without their `ros-` and with ROS's underscores.
 const OF_DEBIAN: [&str; 16] = [
     "actionlib_msgs",
     "diagnostic_msgs",
@@ -22,8 +23,11 @@ const OF_DEBIAN: [&str; 16] = [
     "visualization_msgs",
 ];
 
-/// The error, and what whoever deploys the service can do about it.
-pub(crate) fn explain(error: SchemaError) -> String {
+/// How names of the messages end that ROS 1's actions are made of.
+const OF_ACTIONLIB: [&str; 3] = ["ActionGoal", "ActionResult", "ActionFeedback"];
+
+/// The error, and what can be done about it by whoever deploys the service, or by the client itself.
+pub(crate) fn explain(version: RosVersion, error: SchemaError) -> String {
     let (what, name) = match &error {
         SchemaError::Unknown(name) => (format!("no definition of {name} is known here"), name),
         SchemaError::Missing { name, needed_by } => (
@@ -33,7 +37,14 @@ pub(crate) fn explain(error: SchemaError) -> String {
         _ => return error.to_string(),
     };
     let package = name.split('/').next().unwrap_or_default();
-    if OF_DEBIAN.contains(&package) {
+    if version == RosVersion::Two
+        && (package == "actionlib_msgs" || OF_ACTIONLIB.iter().any(|end| name.ends_with(end)))
+    {
+        return format!(
+            "{what}: actions of ROS 1 are made of topics with such messages, and this servant speaks ROS 2; use send_action_goal and advertise_action"
+        );
+    }
+    if version == RosVersion::One && OF_DEBIAN.contains(&package) {
         let debian = package.replace('_', "-");
         return format!(
             "{what}; whoever deploys this service can add it: cloudroidctl push … --with ros-{debian}"
@@ -50,20 +61,40 @@ mod tests {
 
     #[test]
     fn who_deploys_is_told_what_to_add() {
-        let unknown = explain(SchemaError::Unknown("nav_msgs/Path".to_owned()));
+        let of = |version, name: &str| explain(version, SchemaError::Unknown(name.to_owned()));
         assert_eq!(
-            unknown,
+            of(RosVersion::One, "nav_msgs/Path"),
             "no definition of nav_msgs/Path is known here; whoever deploys this service can add it: cloudroidctl push … --with ros-nav-msgs"
         );
-        let missing = explain(SchemaError::Missing {
+        // Those are not the packages of any distribution of ROS 2.
+        assert_eq!(
+            of(RosVersion::Two, "nav_msgs/msg/Path"),
+            "no definition of nav_msgs/msg/Path is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has nav_msgs, too"
+        );
+        let missing = SchemaError::Missing {
             name: "arm_msgs/Joint".to_owned(),
             needed_by: "arm_msgs/Arm".to_owned(),
-        });
+        };
         assert_eq!(
-            missing,
+            explain(RosVersion::One, missing),
             "arm_msgs/Arm needs arm_msgs/Joint, of which no definition is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has arm_msgs, too"
         );
         let other = SchemaError::BadName("x".to_owned());
-        assert_eq!(explain(other.clone()), other.to_string());
+        assert_eq!(explain(RosVersion::One, other.clone()), other.to_string());
+    }
+
+    #[test]
+    fn who_uses_actions_by_topics_is_told_how_ros_2_has_them() {
+        for name in ["x_msgs/msg/CountActionGoal", "actionlib_msgs/msg/GoalID"] {
+            let two = explain(RosVersion::Two, SchemaError::Unknown(name.to_owned()));
+            assert_eq!(
+                two,
+                format!(
+                    "no definition of {name} is known here: actions of ROS 1 are made of topics with such messages, and this servant speaks ROS 2; use send_action_goal and advertise_action"
+                )
+            );
+            let one = explain(RosVersion::One, SchemaError::Unknown(name.to_owned()));
+            assert!(one.contains("cloudroidctl push"), "{one}");
+        }
     }
 }

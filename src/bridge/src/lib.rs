@@ -44,6 +44,8 @@ mod options;
 mod outbox;
 mod own;
 mod presence;
+mod quality;
+mod refusals;
 mod registrations;
 mod rosapi;
 mod sample;

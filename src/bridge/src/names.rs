@@ -1,9 +1,11 @@
-//! ROS names as clients write them.
+//! Names of ROS as clients write them, and as the servant's ROS does.
 
 use std::borrow::Cow;
 
+use ros::bus::{RosVersion, WireFormat, WireType};
+
 /// The absolute form of a topic's, service's or action's name; clients live in the namespace `/`.
-pub(crate) fn resolve(name: &str) -> Result<Cow<'_, str>, String> {
+pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, String> {
     let well_formed = |part: &str| {
         let mut characters = part.chars();
         characters
@@ -28,24 +30,37 @@ pub(crate) fn resolve(name: &str) -> Result<Cow<'_, str>, String> {
             Cow::Owned(format!("/{name}"))
         });
     }
-    // ROS forgives doubled and trailing slashes, and parts that begin with a digit or underscore after the first.
+    // Doubled and trailing slashes are forgiven.
     let parts: Vec<&str> = name.split('/').filter(|part| !part.is_empty()).collect();
-    let allowed = |part: &&str| {
+    let characters = |part: &&str| {
         part.chars()
             .all(|other| other.is_ascii_alphanumeric() || other == '_')
     };
-    if parts.first().is_some_and(|first| well_formed(first)) && parts.iter().all(allowed) {
+    let starts = match version {
+        // Parts may begin with a digit or an underscore, but for the first.
+        RosVersion::One => parts.first().is_some_and(|first| well_formed(first)),
+        // No part may begin with a digit; those that begin with an underscore are hidden.
+        RosVersion::Two => {
+            let digit = |part: &&str| part.starts_with(|first: char| first.is_ascii_digit());
+            !parts.is_empty() && !parts.iter().any(digit)
+        }
+    };
+    if starts && parts.iter().all(characters) {
         return Ok(Cow::Owned(
             parts.iter().flat_map(|part| ["/", part]).collect(),
         ));
     }
     let shown: String = name.chars().take(64).collect();
+    let rule = match version {
+        RosVersion::One => "a letter comes first",
+        RosVersion::Two => "no part begins with a digit",
+    };
     Err(format!(
-        "{shown:?} is not a ROS name: letters, digits, _ and / are allowed, a letter comes first"
+        "{shown:?} is not a ROS name: letters, digits, _ and / are allowed, {rule}"
     ))
 }
 
-/// `package/Type` of what clients write, ROS 2's `package/msg/Type` included.
+/// `package/Type` of what clients and either ROS write: `package/msg/Type` means the same.
 pub(crate) fn plain_type(name: &str) -> Cow<'_, str> {
     for middle in ["/msg/", "/srv/", "/action/"] {
         if let Some((package, rest)) = name.split_once(middle) {
@@ -55,27 +70,113 @@ pub(crate) fn plain_type(name: &str) -> Cow<'_, str> {
     Cow::Borrowed(name)
 }
 
+/// Whether both mean the type of one name, however they are written.
+pub(crate) fn is_same_type(one: &str, other: &str) -> bool {
+    one == other || plain_type(one) == plain_type(other)
+}
+
+/// The name of a message's type as the servant's ROS writes it: `package/Type` in ROS 1, `package/msg/Type` in ROS 2. What
+/// is no name of a type stays as it is.
+pub(crate) fn spelled(version: RosVersion, name: &str) -> Cow<'_, str> {
+    match version {
+        RosVersion::One => plain_type(name),
+        RosVersion::Two => match name.split_once('/') {
+            Some((package, rest)) if !rest.contains('/') => {
+                Cow::Owned(format!("{package}/msg/{rest}"))
+            }
+            _ => Cow::Borrowed(name),
+        },
+    }
+}
+
+/// The name of a type by which the servant's definitions are looked up.
+pub(crate) fn sought(version: RosVersion, name: &str) -> Cow<'_, str> {
+    match version {
+        RosVersion::One => plain_type(name),
+        // Full names are known as they are, short ones by what they are looked up as.
+        RosVersion::Two => Cow::Borrowed(name),
+    }
+}
+
+/// Messages of the type of this name (any at all, where it is `*`), whatever their definition.
+pub(crate) fn any_definition(version: RosVersion, name: &str) -> WireType {
+    WireType {
+        format: WireFormat::of(version),
+        ..WireType::named(name)
+    }
+}
+
+/// What tells definitions of one name apart, in the words of each ROS.
+pub(crate) fn digest_word(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "MD5",
+        RosVersion::Two => "type hash",
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const BOTH: [RosVersion; 2] = [RosVersion::One, RosVersion::Two];
+
     #[test]
     fn names_become_absolute() {
-        assert!(matches!(
-            resolve("/camera/image_raw"),
-            Ok(Cow::Borrowed("/camera/image_raw"))
-        ));
-        assert_eq!(resolve("chatter").unwrap(), "/chatter");
-        assert_eq!(resolve("//a///b/").unwrap(), "/a/b");
-        assert_eq!(resolve("/a/_b/2").unwrap(), "/a/_b/2");
-        for name in ["", "/", "~x", "/1a", "/a b", "/ä", "a\n", "/_x"] {
-            assert!(resolve(name).is_err(), "{name}");
+        for version in BOTH {
+            assert!(matches!(
+                resolve(version, "/camera/image_raw"),
+                Ok(Cow::Borrowed("/camera/image_raw"))
+            ));
+            assert_eq!(resolve(version, "chatter").unwrap(), "/chatter");
+            assert_eq!(resolve(version, "//a///b/").unwrap(), "/a/b");
+            assert_eq!(resolve(version, "/a/_b").unwrap(), "/a/_b");
+            for name in ["", "/", "~x", "/1a", "/a b", "/ä", "a\n"] {
+                assert!(resolve(version, name).is_err(), "{name}");
+            }
         }
+        let reason = |version, name| resolve(version, name).unwrap_err();
+        assert_eq!(resolve(RosVersion::One, "/a/2").unwrap(), "/a/2");
+        assert_eq!(
+            reason(RosVersion::Two, "/a/2"),
+            "\"/a/2\" is not a ROS name: letters, digits, _ and / are allowed, no part begins with a digit"
+        );
+        assert_eq!(resolve(RosVersion::Two, "/_x").unwrap(), "/_x");
+        assert_eq!(
+            reason(RosVersion::One, "/_x"),
+            "\"/_x\" is not a ROS name: letters, digits, _ and / are allowed, a letter comes first"
+        );
     }
 
     #[test]
-    fn types_of_ros_2_are_understood() {
-        assert_eq!(plain_type("std_msgs/msg/String"), "std_msgs/String");
-        assert_eq!(plain_type("std_msgs/String"), "std_msgs/String");
+    fn types_are_written_as_either_ros_does() {
+        let message = |version, name| spelled(version, name).into_owned();
+        for name in ["std_msgs/msg/String", "std_msgs/String"] {
+            assert_eq!(plain_type(name), "std_msgs/String");
+            assert_eq!(message(RosVersion::One, name), "std_msgs/String");
+            assert_eq!(message(RosVersion::Two, name), "std_msgs/msg/String");
+            assert!(is_same_type(name, "std_msgs/String"));
+            assert!(!is_same_type(name, "std_msgs/Int32"));
+        }
+        assert_eq!(
+            message(RosVersion::Two, "a/action/B_Goal"),
+            "a/action/B_Goal"
+        );
+        assert_eq!(message(RosVersion::Two, "*"), "*");
+        assert_eq!(message(RosVersion::Two, ""), "");
+    }
+
+    #[test]
+    fn whoever_takes_any_definition_takes_those_of_its_ros() {
+        for version in BOTH {
+            let any = any_definition(version, "*");
+            let own = WireType {
+                format: WireFormat::of(version),
+                ..WireType::new("a/B", "1234", "")
+            };
+            assert!(any.agrees(&own));
+            for other in BOTH {
+                assert_eq!(any_definition(other, "a/B").agrees(&own), other == version);
+            }
+        }
     }
 }

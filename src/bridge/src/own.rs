@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use access::Grants;
 use async_trait::async_trait;
-use ros::schema::{Registry, ServiceDef};
+use ros::schema::ServiceDef;
 
 use crate::shared::Shared;
 use crate::{rosapi, tf};
@@ -22,8 +22,8 @@ pub(crate) trait OwnService: Send + Sync {
         false
     }
 
-    /// Its definition; `registry` has the servant's types.
-    fn definition(&self, registry: &Registry) -> Result<Arc<ServiceDef>, String>;
+    /// Its definition, in the servant's ROS.
+    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String>;
 
     /// The response, as JSON, to a request in JSON: what a client with these grants is shown.
     async fn answer(

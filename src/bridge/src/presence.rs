@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Message, WireType};
+use ros::bus::{Message, RosVersion, WireType};
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
@@ -15,17 +15,21 @@ const CLIENTS: &str = "/connected_clients";
 /// Both topics.
 pub(crate) const TOPICS: [&str; 2] = [COUNT, CLIENTS];
 
-const DEFINITIONS: [(&str, &str); 3] = [
-    ("std_msgs/Int32", "int32 data\n"),
-    (
-        "rosbridge_msgs/ConnectedClient",
-        "string ip_address\ntime connection_time\n",
-    ),
-    (
-        "rosbridge_msgs/ConnectedClients",
-        "ConnectedClient[] clients\n",
-    ),
-];
+/// Types of these topics and what they contain, for one ROS.
+fn definitions(version: RosVersion) -> [(&'static str, &'static str); 3] {
+    let client = match version {
+        RosVersion::One => "string ip_address\ntime connection_time\n",
+        RosVersion::Two => "string ip_address\nbuiltin_interfaces/Time connection_time\n",
+    };
+    [
+        ("std_msgs/msg/Int32", "int32 data\n"),
+        ("rosbridge_msgs/msg/ConnectedClient", client),
+        (
+            "rosbridge_msgs/msg/ConnectedClients",
+            "ConnectedClient[] clients\n",
+        ),
+    ]
+}
 
 /// Who is connected.
 #[derive(Default)]
@@ -40,17 +44,19 @@ struct Present {
 }
 
 /// The type of one of these topics.
-pub(crate) fn type_name(topic: &str) -> Option<&'static str> {
-    match topic {
-        COUNT => Some("std_msgs/Int32"),
-        CLIENTS => Some("rosbridge_msgs/ConnectedClients"),
+pub(crate) fn type_name(version: RosVersion, topic: &str) -> Option<&'static str> {
+    match (topic, version) {
+        (COUNT, RosVersion::One) => Some("std_msgs/Int32"),
+        (COUNT, RosVersion::Two) => Some("std_msgs/msg/Int32"),
+        (CLIENTS, RosVersion::One) => Some("rosbridge_msgs/ConnectedClients"),
+        (CLIENTS, RosVersion::Two) => Some("rosbridge_msgs/msg/ConnectedClients"),
         _ => None,
     }
 }
 
 /// Adds the types of these topics where the servant has none of these names.
-pub(crate) fn define(registry: &Registry) {
-    for (name, text) in DEFINITIONS {
+pub(crate) fn define(version: RosVersion, registry: &Registry) {
+    for (name, text) in definitions(version) {
         if registry.message(name).is_err()
             && let Err(error) = registry.insert(name, text)
         {

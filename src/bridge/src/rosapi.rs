@@ -3,13 +3,16 @@
 
 mod definitions;
 mod graph;
+mod node_params;
 mod params;
 mod typedefs;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use access::Grants;
 use async_trait::async_trait;
+use ros::bus::RosVersion;
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use serde::Deserialize;
@@ -18,6 +21,7 @@ use serde_json::{Value, json};
 use crate::clock;
 use crate::own::OwnService;
 use crate::shared::Shared;
+use typedefs::Definitions;
 
 /// The node that seems to serve these services.
 const NODE: &str = "/rosapi";
@@ -37,6 +41,7 @@ struct Args {
     #[serde(rename = "type")]
     type_name: String,
     service: String,
+    action: String,
     node: String,
     name: String,
     value: String,
@@ -67,9 +72,9 @@ impl Service {
         format!("{NODE}/{}", self.name)
     }
 
-    /// `rosapi/…`.
-    pub(crate) fn type_name(self) -> String {
-        format!("rosapi/{}", self.srv)
+    /// `rosapi/…`, in ROS 2 `rosapi_msgs/srv/…`.
+    pub(crate) fn type_name(self, version: RosVersion) -> String {
+        definitions::type_name(version, self.srv)
     }
 
     async fn values(
@@ -78,42 +83,75 @@ impl Service {
         args: &Args,
         grants: &Grants,
     ) -> Result<Value, String> {
-        let now = graph::shown(graph::with_own_topics(&shared.bus.graph().borrow()), grants);
+        let version = shared.bus.version();
+        let now = graph::with_own_topics(version, &shared.bus.graph().borrow());
+        let now = graph::shown(now, grants);
+        let definitions = Definitions {
+            version,
+            registry: &shared.registry,
+        };
         Ok(match self.name {
             "topics" => graph::topics(&now),
             "topics_for_type" => graph::topics_for_type(&now, &args.type_name),
-            "topics_and_raw_types" => graph::topics_and_raw_types(&now, &shared.registry),
+            "topics_and_raw_types" => graph::topics_and_raw_types(&now, version, &shared.registry),
             "topic_type" => graph::topic_type(&now, &args.topic),
             "publishers" => graph::publishers(&now, &args.topic),
             "subscribers" => graph::subscribers(&now, &args.topic),
             "nodes" => graph::nodes(&now),
             "node_details" => graph::node_details(&now, &args.node),
             "action_servers" => graph::action_servers(&now),
+            "action_type" => graph::action_type(&now, &args.action),
             "services" => graph::services(&now),
             "service_node" => graph::service_node(&now, &args.service),
-            "service_host" => graph::service_host(&now, &args.service),
+            "service_host" => graph::service_host(&now, version, &args.service),
             "service_type" => graph::service_type(shared, &args.service, grants).await,
             "services_for_type" => graph::services_for_type(shared, &now, &args.type_name).await,
             "service_providers" => graph::service_providers(shared, &now, &args.service).await,
-            "message_details" => typedefs::message(&shared.registry, &args.type_name)?,
-            "service_request_details" => typedefs::request(&shared.registry, &args.type_name)?,
-            "service_response_details" => typedefs::response(&shared.registry, &args.type_name)?,
-            "get_param" => params::get(shared, args).await?,
-            "set_param" => params::set(shared, args).await?,
-            "has_param" => params::has(shared, args).await?,
-            "search_param" => params::search(shared, args).await?,
-            "delete_param" => params::delete(shared, args).await?,
-            "get_param_names" => params::names(shared).await?,
-            "get_time" => {
-                let Time { secs, nsecs } = clock::now(shared).await;
-                json!({ "time": { "secs": secs, "nsecs": nsecs } })
+            "interfaces" => interfaces(version, &shared.registry),
+            "message_details" => definitions.message(&args.type_name)?,
+            "service_request_details" => definitions.request(&args.type_name)?,
+            "service_response_details" => definitions.response(&args.type_name)?,
+            "action_goal_details" => definitions.of_action(&args.type_name, |of| &of.goal)?,
+            "action_result_details" => definitions.of_action(&args.type_name, |of| &of.result)?,
+            "action_feedback_details" => {
+                definitions.of_action(&args.type_name, |of| &of.feedback)?
             }
+            name if name.contains("param") => match version {
+                RosVersion::One => self.shared_param(shared, args).await?,
+                RosVersion::Two => self.node_param(shared, args).await?,
+            },
+            "get_time" => time(version, clock::now(shared).await),
             "get_ros_version" => json!({
-                "version": shared.bus.version().number(),
+                "version": version.number(),
                 "distro": shared.bus.distribution().await,
             }),
             other => return Err(format!("rosapi has no service {other}")),
         })
+    }
+
+    /// About parameters that all nodes share.
+    async fn shared_param(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+        match self.name {
+            "get_param" => params::get(shared, args).await,
+            "set_param" => params::set(shared, args).await,
+            "has_param" => params::has(shared, args).await,
+            "search_param" => params::search(shared, args).await,
+            "delete_param" => params::delete(shared, args).await,
+            _ => params::names(shared).await,
+        }
+    }
+
+    /// About parameters that belong to nodes.
+    async fn node_param(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+        match self.name {
+            "get_param" => node_params::get(shared, args).await,
+            "set_param" => node_params::set(shared, args).await,
+            "has_param" => node_params::has(shared, args).await,
+            // Nodes have nobody above them of whom to inherit one.
+            "search_param" => params::search(shared, args).await,
+            "delete_param" => node_params::delete(shared, args).await,
+            _ => node_params::names(shared).await,
+        }
     }
 }
 
@@ -124,15 +162,16 @@ impl OwnService for Service {
     }
 
     fn shows_graph(&self) -> bool {
-        !matches!(self.name, "get_time" | "get_ros_version")
+        !matches!(self.name, "get_time" | "get_ros_version" | "interfaces")
             && !self.name.contains("param")
             && !self.name.ends_with("_details")
             || self.name == "node_details"
     }
 
-    fn definition(&self, _: &Registry) -> Result<Arc<ServiceDef>, String> {
-        definitions::registry()
-            .service(&self.type_name())
+    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String> {
+        let version = shared.bus.version();
+        definitions::registry(version)
+            .service(&self.type_name(version))
             .map_err(|error| error.to_string())
     }
 
@@ -149,6 +188,26 @@ impl OwnService for Service {
 }
 
 /// A type's definition in the servant's registry, or among rosapi's own.
-fn with_own<T, E>(registry: &Registry, find: impl Fn(&Registry) -> Result<T, E>) -> Result<T, E> {
-    find(registry).or_else(|error| find(definitions::registry()).map_err(|_| error))
+fn with_own<T, E>(
+    version: RosVersion,
+    registry: &Registry,
+    find: impl Fn(&Registry) -> Result<T, E>,
+) -> Result<T, E> {
+    find(registry).or_else(|error| find(definitions::registry(version)).map_err(|_| error))
+}
+
+/// Every definition that is known.
+fn interfaces(version: RosVersion, registry: &Registry) -> Value {
+    let own = definitions::registry(version).keys();
+    let all: BTreeSet<String> = registry.keys().into_iter().chain(own).collect();
+    json!({ "interfaces": all })
+}
+
+/// A time as the ROS writes it. Of ROS 2's there are also the names that it has in ROS 1: roslibpy reads those alone.
+fn time(version: RosVersion, Time { secs, nsecs }: Time) -> Value {
+    let time = match version {
+        RosVersion::One => json!({ "secs": secs, "nsecs": nsecs }),
+        RosVersion::Two => json!({ "sec": secs, "nanosec": nsecs, "secs": secs, "nsecs": nsecs }),
+    };
+    json!({ "time": time })
 }

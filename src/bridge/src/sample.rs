@@ -13,6 +13,7 @@ use ros::codec::{self, CborOptions, JsonOptions, Time};
 use ros::schema::{MessageType, Registry};
 use rosbridge::{Compression, Format, Publish};
 
+use crate::names::digest_word;
 use crate::{BridgeOptions, Metrics};
 use ws::frame::{BINARY, TEXT};
 
@@ -150,9 +151,10 @@ impl TopicTypes {
     }
 }
 
-/// The registry's type where its MD5 agrees, else one made from the definition that the publisher sent.
+/// The registry's type where its digest agrees, else one made from the definition that the publisher sent.
 fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, String> {
-    let agrees = |found: &MessageType| wire.digest.agrees(&found.md5().into());
+    let agrees = |found: &MessageType| wire.digest.agrees(&found.digest().into());
+    let word = digest_word(wire.format.version());
     let ours = match registry.message(&wire.name) {
         Ok(found) if agrees(&found) => return Ok(found),
         ours => ours,
@@ -160,10 +162,10 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
     if wire.definition.is_empty() {
         return Err(match ours {
             Ok(found) => format!(
-                "its type {} has MD5 {}, ours has {}",
+                "its type {} has {word} {}, ours has {}",
                 wire.name,
                 wire.digest,
-                found.md5()
+                found.digest()
             ),
             Err(error) => error.to_string(),
         });
@@ -178,9 +180,9 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
     match theirs {
         Ok(found) if agrees(&found) => Ok(found),
         Ok(found) => Err(format!(
-            "the publisher's definition of {} has MD5 {}, not {} as it says",
+            "the publisher's definition of {} has {word} {}, not {} as it says",
             wire.name,
-            found.md5(),
+            found.digest(),
             wire.digest
         )),
         Err(error) => Err(error.to_string()),

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, PeerId};
+use ros::bus::{Bus, Message, PeerId, Qos, RosVersion};
 use ros::schema::{MessageType, Registry};
 use ros::sizes::Inputs;
 use tokio::sync::watch;
@@ -14,6 +14,7 @@ use crate::bridge::SessionCount;
 use crate::client::Client;
 use crate::fanout::Fanout;
 use crate::presence::{self, Presence};
+use crate::quality::all_there_is;
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
 use crate::tf::{self, Republisher};
@@ -35,7 +36,7 @@ pub(crate) struct Shared {
     pub(crate) inputs: Inputs,
     /// Requests that are made by topic.
     requests: Option<Arc<TopicRequests>>,
-    fanouts: Mutex<HashMap<String, Weak<Fanout>>>,
+    fanouts: Mutex<HashMap<String, Vec<Known>>>,
     /// Topics of nodes that somebody listens to.
     heard: Arc<AtomicUsize>,
     /// What clients publish on, by topic.
@@ -43,6 +44,23 @@ pub(crate) struct Shared {
     clients: Mutex<Clients>,
     pub(crate) sessions: watch::Sender<SessionCount>,
     numbers: AtomicU64,
+}
+
+/// One of the fanouts of a topic.
+struct Known {
+    /// What it asks of the topic's publishers; none of a topic of the bridge itself, which is the same for all.
+    qos: Option<Qos>,
+    /// The type whose publishers it hears; none where it hears those of all, as in ROS 1.
+    type_name: Option<String>,
+    fanout: Weak<Fanout>,
+}
+
+impl Known {
+    fn serves(&self, qos: Qos, type_name: Option<&str>) -> bool {
+        let hears = |(own, asked): (&str, &str)| own == asked;
+        self.qos.is_none_or(|own| own == qos)
+            && self.type_name.as_deref().zip(type_name).is_none_or(hears)
+    }
 }
 
 /// Counts a topic of the nodes that is listened to.
@@ -68,8 +86,8 @@ impl Shared {
         registry: Arc<Registry>,
         options: BridgeOptions,
     ) -> Arc<Self> {
-        presence::define(&registry);
-        tf::define(&registry);
+        presence::define(bus.version(), &registry);
+        tf::define(bus.version(), &registry);
         let requests = options.pair.as_ref().map(TopicRequests::of);
         Arc::new(Self {
             bus,
@@ -146,34 +164,55 @@ impl Shared {
         client.end();
     }
 
-    /// The topic's fanout; begun if it is not there.
+    /// The topic's fanout for who takes all there is; begun if it is not there.
     pub(crate) fn fanout(
         self: &Arc<Self>,
         topic: &str,
         message_type: Option<&MessageType>,
     ) -> Arc<Fanout> {
+        self.fanout_of(topic, message_type, all_there_is(self.options.bus_queue))
+    }
+
+    /// The same for who asks this of its publishers.
+    pub(crate) fn fanout_of(
+        self: &Arc<Self>,
+        topic: &str,
+        message_type: Option<&MessageType>,
+        qos: Qos,
+    ) -> Arc<Fanout> {
+        // In ROS 2 ends of different types do not meet.
+        let type_name = message_type.filter(|found| found.version() == RosVersion::Two);
+        let type_name = type_name.map(MessageType::name);
         let mut fanouts = self.fanouts.lock();
-        if let Some(fanout) = fanouts.get(topic).and_then(Weak::upgrade) {
+        let mut of_topic = fanouts.get(topic).into_iter().flatten();
+        let known = of_topic.find(|known| known.serves(qos, type_name));
+        if let Some(fanout) = known.and_then(|known| known.fanout.upgrade()) {
             return fanout;
         }
-        let fanout = match self.own_topic(topic) {
+        let (fanout, asked) = match self.own_topic(topic) {
             Some(own) => {
                 let fanout = Fanout::internal(self, topic);
-                if presence::type_name(topic).is_some() {
+                if presence::type_name(self.bus.version(), topic).is_some() {
                     self.report_presence_to(&fanout, &own);
                 }
-                fanout
+                (fanout, None)
             }
-            None => Fanout::start(self, topic, message_type),
+            None => (Fanout::start(self, topic, message_type, qos), Some(qos)),
         };
         let topic_publishers = self.publishers_of(topic);
-        for message in topic_publishers
+        let latched = topic_publishers
             .iter()
-            .filter_map(|topic_publisher| topic_publisher.latched())
-        {
+            .filter_map(|topic_publisher| topic_publisher.latched());
+        for message in latched.filter(|_| fanout.keeps()) {
             fanout.deliver(message, true);
         }
-        fanouts.insert(topic.to_owned(), Arc::downgrade(&fanout));
+        let of_topic = fanouts.entry(topic.to_owned()).or_default();
+        of_topic.retain(|known| known.fanout.strong_count() > 0);
+        of_topic.push(Known {
+            type_name: type_name.filter(|_| asked.is_some()).map(str::to_owned),
+            qos: asked,
+            fanout: Arc::downgrade(&fanout),
+        });
         // The last owner of an topic_publisher must not drop it under the lock.
         drop(fanouts);
         fanout
@@ -181,7 +220,9 @@ impl Shared {
 
     /// The type of a topic that the bridge itself publishes, unless a node of the servant has one of this name.
     fn own_topic(&self, topic: &str) -> Option<Arc<MessageType>> {
-        let name = presence::type_name(topic).or_else(|| self.republisher.type_name(topic))?;
+        let version = self.bus.version();
+        let made = || self.republisher.type_name(version, topic);
+        let name = presence::type_name(version, topic).or_else(made)?;
         let taken = self.bus.graph().borrow().topics.contains_key(topic);
         self.registry.message(name).ok().filter(|_| !taken)
     }
@@ -200,10 +241,10 @@ impl Shared {
     /// Tells who listens that somebody has come or gone.
     pub(crate) fn report_presence(&self) {
         for topic in presence::TOPICS {
-            let fanout = self
-                .live_fanout(topic)
-                .filter(|fanout| fanout.is_internal());
-            let own = presence::type_name(topic).and_then(|name| self.registry.message(name).ok());
+            let mut live = self.live_fanouts(topic).into_iter();
+            let fanout = live.find(|fanout| fanout.is_internal());
+            let name = presence::type_name(self.bus.version(), topic);
+            let own = name.and_then(|name| self.registry.message(name).ok());
             if let (Some(fanout), Some(own)) = (fanout, own) {
                 self.report_presence_to(&fanout, &own);
             }
@@ -251,10 +292,10 @@ impl Shared {
             }
         }
         drop(topic_publishers);
-        if topic_publisher.latch
-            && let Some(fanout) = self.live_fanout(&topic_publisher.topic)
-        {
-            fanout.forget(&topic_publisher.id);
+        if topic_publisher.offer.latch {
+            for fanout in self.live_fanouts(&topic_publisher.topic) {
+                fanout.forget(&topic_publisher.id);
+            }
         }
     }
 
@@ -264,25 +305,40 @@ impl Shared {
         let known = topic_publishers
             .first()
             .map(|topic_publisher| topic_publisher.message_type.name());
+        let version = self.bus.version();
         known
-            .or(presence::type_name(topic))
-            .or_else(|| self.republisher.type_name(topic))
+            .or(presence::type_name(version, topic))
+            .or_else(|| self.republisher.type_name(version, topic))
             .map(str::to_owned)
     }
 
-    /// The topic's fanout, if anybody listens.
-    pub(crate) fn live_fanout(&self, topic: &str) -> Option<Arc<Fanout>> {
-        self.fanouts.lock().get(topic).and_then(Weak::upgrade)
+    /// The topic's fanouts; none if nobody listens.
+    pub(crate) fn live_fanouts(&self, topic: &str) -> Vec<Arc<Fanout>> {
+        let fanouts = self.fanouts.lock();
+        let of_topic = fanouts.get(topic).into_iter().flatten();
+        // None is dropped here: its last owner would forget it, under the lock.
+        of_topic
+            .filter_map(|known| known.fanout.upgrade())
+            .collect()
+    }
+
+    /// Hands a message of the bridge's own, or of one of its clients, to all who listen; false where nobody does.
+    pub(crate) fn deliver(&self, topic: &str, message: &Message) -> bool {
+        let fanouts = self.live_fanouts(topic);
+        for fanout in &fanouts {
+            fanout.deliver(message.clone(), true);
+        }
+        !fanouts.is_empty()
     }
 
     /// Forgets a fanout that is gone, or that will never carry anything.
     pub(crate) fn forget_fanout(&self, fanout: &Fanout) {
         let mut fanouts = self.fanouts.lock();
-        if fanouts
-            .get(&fanout.topic)
-            .is_some_and(|known| std::ptr::eq(known.as_ptr(), fanout))
-        {
-            fanouts.remove(&fanout.topic);
+        if let Some(of_topic) = fanouts.get_mut(&fanout.topic) {
+            of_topic.retain(|known| !std::ptr::eq(known.fanout.as_ptr(), fanout));
+            if of_topic.is_empty() {
+                fanouts.remove(&fanout.topic);
+            }
         }
     }
 

@@ -3,25 +3,33 @@
 //! unless the servant has such a node.
 //!
 //! * the service `/republish_tfs`, which names a topic of `tf2_web_republisher/TFArray` made for the caller;
-//! * the action `/tf2_web_republisher`, whose feedback carries the transforms for as long as the goal is active.
+//! * the action `/tf2_web_republisher`, whose feedback carries the transforms for as long as the goal is active: by
+//!   topics in ROS 1, by operations in either ROS.
+//!
+//! In ROS 2 its types are of the package `tf2_web_republisher_interfaces`.
 
+mod action;
 mod buffer;
 mod republish;
+mod sending;
 mod transform;
 
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
+use ros::bus::RosVersion;
 use ros::codec::{self, CodecError, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
 
+pub(crate) use action::own_action;
 use buffer::Buffer;
 pub(crate) use republish::{
     ACTION, GOAL_TOPIC, RepublishTfs, Republisher, SERVICE, STATUS_TOPIC, TOPICS,
 };
 use transform::Transform;
 
+/// Transforms, in words that mean the same to both ROSes.
 const DEFINITIONS: &[(&str, &str)] = &[
     (
         "geometry_msgs/msg/Vector3",
@@ -37,28 +45,64 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ),
     (
         "geometry_msgs/msg/TransformStamped",
-        "Header header\nstring child_frame_id\nTransform transform\n",
-    ),
-    (
-        "tf2_web_republisher/msg/TFArray",
-        "geometry_msgs/TransformStamped[] transforms\n",
-    ),
-    (
-        "tf2_web_republisher/srv/RepublishTFs",
-        "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n\
-         duration timeout\n---\nstring topic_name\n",
-    ),
-    (
-        "tf2_web_republisher/action/TFSubscription",
-        "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n\
-         ---\n---\ngeometry_msgs/TransformStamped[] transforms\n",
+        "std_msgs/Header header\nstring child_frame_id\nTransform transform\n",
     ),
 ];
 
+/// What callers and goals ask for.
+const WANTED: &str = "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n";
+const TRANSFORMS: &str = "geometry_msgs/TransformStamped[] transforms\n";
+
+/// Where the republisher's own types are.
+fn package(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "tf2_web_republisher",
+        RosVersion::Two => "tf2_web_republisher_interfaces",
+    }
+}
+
+/// Name of the type of topics that are made for callers.
+fn array_name(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "tf2_web_republisher/TFArray",
+        RosVersion::Two => "tf2_web_republisher_interfaces/msg/TFArray",
+    }
+}
+
+/// Name of the action's type.
+pub(crate) fn action_name(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "tf2_web_republisher/TFSubscription",
+        RosVersion::Two => "tf2_web_republisher_interfaces/action/TFSubscription",
+    }
+}
+
+/// The republisher's own types.
+fn own_definitions(version: RosVersion) -> [(String, String); 3] {
+    let package = package(version);
+    let duration = match version {
+        RosVersion::One => "duration",
+        RosVersion::Two => "builtin_interfaces/Duration",
+    };
+    [
+        (format!("{package}/msg/TFArray"), TRANSFORMS.to_owned()),
+        (
+            format!("{package}/srv/RepublishTFs"),
+            format!("{WANTED}{duration} timeout\n---\nstring topic_name\n"),
+        ),
+        (
+            format!("{package}/action/TFSubscription"),
+            format!("{WANTED}---\n---\n{TRANSFORMS}"),
+        ),
+    ]
+}
+
 /// Adds the types that are needed and that the servant does not have.
-pub(crate) fn define(registry: &Registry) {
+pub(crate) fn define(version: RosVersion, registry: &Registry) {
     let known = registry.keys();
-    for (key, text) in DEFINITIONS {
+    let own = own_definitions(version);
+    let own = own.iter().map(|(key, text)| (key.as_str(), text.as_str()));
+    for (key, text) in DEFINITIONS.iter().copied().chain(own) {
         if known.iter().all(|other| other != key)
             && let Err(error) = registry.insert(key, text)
         {

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Matched, Message, PeerId, Publisher, Qos, WireType};
+use ros::bus::{Matched, Message, PeerId, Publisher, WireType};
 use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
 use ros::sizes::Sizes;
@@ -14,6 +14,8 @@ use tokio::sync::watch;
 use tokio::time::timeout_at;
 
 use crate::INSIDE;
+use crate::quality::Offer;
+use crate::refusals::Refusals;
 use crate::shared::Shared;
 use crate::topic_requests::TopicRequests;
 
@@ -25,6 +27,14 @@ const WARM: Bounds = Bounds {
 
 /// So many times as long a node is waited for that has registered, where nobody else is connected: on a busy machine rospy takes seconds.
 const ALONE: u32 = 10;
+
+/// Whoever publishes, for what must be known of the topic.
+pub(crate) trait Notified: Send + Sync + 'static {
+    /// It cannot be advertised.
+    fn failed(&self, reason: &str);
+    /// A subscriber hears nothing, because it asks for something else. Told once of each.
+    fn refused(&self, reason: &str);
+}
 
 /// Until when subscribers are waited for.
 #[derive(Clone, Copy)]
@@ -39,7 +49,7 @@ struct Patience {
 pub(crate) struct TopicPublisher {
     pub(crate) topic: String,
     pub(crate) message_type: Arc<MessageType>,
-    pub(crate) latch: bool,
+    pub(crate) offer: Offer,
     wire_type: Arc<WireType>,
     sizes: Arc<Sizes>,
     /// Tells this topic_publisher's latched message from others'.
@@ -82,21 +92,20 @@ impl State {
 }
 
 impl TopicPublisher {
-    /// Advertises in the background; `failed` is told if that does not succeed.
+    /// Advertises in the background.
     pub(crate) fn open(
         shared: &Arc<Shared>,
         topic: &str,
         message_type: Arc<MessageType>,
-        latch: bool,
-        queue: usize,
-        failed: impl FnOnce(String) + Send + 'static,
+        offer: Offer,
+        notified: Arc<dyn Notified>,
     ) -> Arc<TopicPublisher> {
         let wire_type = WireType::of(&message_type);
         let topic_publisher = Arc::new(TopicPublisher {
             topic: topic.to_owned(),
             sizes: shared.inputs.of(topic, Some(&message_type)),
             message_type,
-            latch,
+            offer,
             wire_type: Arc::new(wire_type.clone()),
             id: PeerId::new(format!("client#{}", shared.next_number()), 0),
             requests: shared.requests_on(topic),
@@ -107,8 +116,7 @@ impl TopicPublisher {
         });
         shared.add_outlet(&topic_publisher);
         // Holds the topic_publisher until what was published at once has been sent, even if the client is gone by then.
-        let qos = Qos::keep_last(queue).latching(latch);
-        tokio::spawn(warm_up(topic_publisher.clone(), wire_type, qos, failed));
+        tokio::spawn(warm_up(topic_publisher.clone(), wire_type, notified));
         topic_publisher
     }
 
@@ -118,10 +126,10 @@ impl TopicPublisher {
         if self.shared.hears_nodes() {
             self.shared.metrics.asked.add(1);
         }
-        if self.latch {
+        if self.offer.latch {
             *self.last.lock() = Some(bytes.clone());
         }
-        if let Some(fanout) = self.shared.live_fanout(&self.topic) {
+        for fanout in self.shared.live_fanouts(&self.topic) {
             fanout.deliver(self.message(bytes.clone()), true);
         }
         let mut state = self.state.lock();
@@ -164,7 +172,7 @@ impl TopicPublisher {
             bytes,
             wire_type: self.wire_type.clone(),
             publisher: self.id.clone(),
-            latching: self.latch,
+            latching: self.offer.latch,
         }
     }
 
@@ -195,8 +203,8 @@ impl TopicPublisher {
         }
     }
 
-    /// Nodes that the Master names as subscribers, and that are not connected. The bridge itself may be among those
-    /// that are named, but never connects.
+    /// Nodes that the graph names as subscribers, and that are not connected. The bridge itself may be among those
+    /// that are named, but never connects; nor does who asks for something else.
     fn missing(&self, matched: &Matched) -> BTreeSet<Node> {
         let bus = &self.shared.bus;
         let graph = bus.graph().borrow().clone();
@@ -206,7 +214,8 @@ impl TopicPublisher {
         nodes
             .subscribers
             .iter()
-            .filter(|name| *name != bus.node() && *name != INSIDE && !matched.has_node(name))
+            .filter(|name| *name != bus.node() && *name != INSIDE)
+            .filter(|name| !matched.has_node(name) && !is_refused(matched, name))
             .map(|name| {
                 let address = graph.nodes.get(name).cloned();
                 (name.clone(), address.unwrap_or_default())
@@ -246,22 +255,25 @@ impl Drop for TopicPublisher {
     }
 }
 
-async fn warm_up(
-    topic_publisher: Arc<TopicPublisher>,
-    of: WireType,
-    qos: Qos,
-    failed: impl FnOnce(String) + Send,
-) {
+/// Whether an end of this node's cannot match.
+fn is_refused(matched: &Matched, node: &str) -> bool {
+    let mut refused = matched.refused.iter();
+    refused.any(|refusal| refusal.peer.node() == node)
+}
+
+async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: Arc<dyn Notified>) {
     let shared = topic_publisher.shared.clone();
     let patience = topic_publisher.patience();
-    let publisher = match shared.bus.advertise(&topic_publisher.topic, of, qos).await {
+    let (topic, qos) = (&topic_publisher.topic, topic_publisher.offer.qos);
+    let publisher = match shared.bus.advertise(topic, of, qos).await {
         Ok(publisher) => publisher,
         Err(error) => {
             *topic_publisher.state.lock() = State::Failed;
-            return failed(error.to_string());
+            return notified.failed(&error.to_string());
         }
     };
     let subscribers = publisher.matched();
+    tokio::spawn(tell_refused(subscribers.clone(), notified));
     if let State::Warming {
         publisher: held, ..
     } = &mut *topic_publisher.state.lock()
@@ -269,6 +281,20 @@ async fn warm_up(
         *held = Some(publisher);
     }
     settle(topic_publisher, subscribers, patience).await;
+}
+
+/// Tells of subscribers that ask for something else, for as long as the topic is advertised.
+async fn tell_refused(mut subscribers: watch::Receiver<Matched>, notified: Arc<dyn Notified>) {
+    let mut refusals = Refusals::default();
+    loop {
+        let new = refusals.update(&subscribers.borrow_and_update());
+        for reason in new {
+            notified.refused(&reason);
+        }
+        if subscribers.changed().await.is_err() {
+            return;
+        }
+    }
 }
 
 /// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits. As long as nobody at all is

@@ -14,6 +14,19 @@ use crate::BridgeOptions;
 /// Only bounds how long a failing test takes.
 const PATIENCE: Duration = Duration::from_secs(120);
 
+/// Nothing may go wrong.
+struct Fails;
+
+impl Notified for Fails {
+    fn failed(&self, reason: &str) {
+        panic!("{reason}")
+    }
+
+    fn refused(&self, reason: &str) {
+        panic!("{reason}")
+    }
+}
+
 async fn in_graph(bus: &dyn Bus, condition: impl Fn(&Graph) -> bool) {
     let mut graph = bus.graph();
     let seen = graph.wait_for(|graph| condition(graph));
@@ -80,9 +93,17 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
             .is_some_and(|nodes| nodes.subscribers == ["/odd"])
     })
     .await;
-    let failed = |reason| panic!("{reason}");
-    let topic_publisher =
-        TopicPublisher::open(&shared, "/number", message_type.clone(), false, 10, failed);
+    let offer = Offer {
+        qos: Qos::keep_last(10),
+        latch: false,
+    };
+    let topic_publisher = TopicPublisher::open(
+        &shared,
+        "/number",
+        message_type.clone(),
+        offer,
+        Arc::new(Fails),
+    );
     let subscribers = advertised(&topic_publisher).await;
     assert!(!is_live(&topic_publisher), "it waits");
     let over = Instant::now();

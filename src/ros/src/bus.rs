@@ -35,7 +35,7 @@ pub use node_parameters::{
     ParameterEvents, ParameterKind, ParameterNames,
 };
 pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
-pub use qos::{Durability, Qos, Reliability};
+pub use qos::{Durability, Liveliness, Qos, Reliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
 pub use types::{Digest, ServiceType, WireFormat, WireType};
 

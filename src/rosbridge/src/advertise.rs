@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Id, Problem, Writer};
+use crate::{Id, Problem, Qos, Writer};
 
 /// "I will publish on this topic."
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,13 +19,16 @@ pub struct Advertise<'a> {
     pub latch: bool,
     /// Messages kept per slow subscriber.
     pub queue_size: Option<u64>,
-    /// What the client's own definition hashes to, for clients that publish ROS bytes (extension).
+    /// What the client's own definition hashes to (MD5, or the type hash of ROS 2), for clients that publish ROS bytes (extension).
     pub md5sum: Option<Cow<'a, str>>,
+    /// What the client offers.
+    pub qos: Option<Qos>,
 }
 
 impl<'a> Message<'a> for Advertise<'a> {
     const OP: &'static str = "advertise";
-    const FIELDS: &'static [&'static str] = &["topic", "type", "latch", "queue_size", "md5sum"];
+    const FIELDS: &'static [&'static str] =
+        &["topic", "type", "latch", "queue_size", "md5sum", "qos"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
@@ -35,7 +38,8 @@ impl<'a> Message<'a> for Advertise<'a> {
                 .required_text("type", "a message type such as \"std_msgs/String\"")?,
             latch: fields.boolean("latch")?.unwrap_or(false),
             queue_size: fields.count("queue_size", 0, "a number of messages")?,
-            md5sum: fields.text("md5sum", "the definition's MD5 in hex")?,
+            md5sum: fields.text("md5sum", "the definition's MD5 in hex, or its type hash,")?,
+            qos: Qos::read(fields)?,
         })
     }
 
@@ -51,6 +55,7 @@ impl<'a> Message<'a> for Advertise<'a> {
         }
         writer.optional_count("queue_size", self.queue_size);
         writer.optional_text("md5sum", &self.md5sum);
+        Qos::write(self.qos, writer);
     }
 }
 
@@ -96,6 +101,7 @@ mod tests {
             latch: true,
             queue_size: Some(100),
             md5sum: None,
+            qos: None,
         }
     }
 

@@ -70,7 +70,7 @@ impl<'a> Fields<'a> {
     }
 
     /// The value of a field; the last one wins as in every JSON parser, `null` is as good as absent.
-    fn get(&self, field: &str) -> Option<&'a [u8]> {
+    pub(crate) fn get(&self, field: &str) -> Option<&'a [u8]> {
         let (_, value) = self.found.iter().rev().find(|(name, _)| name == field)?;
         (!self.is_null(value)).then_some(*value)
     }
@@ -115,7 +115,12 @@ impl<'a> Fields<'a> {
         }
     }
 
-    fn mistyped(&self, field: &'static str, expected: &'static str, value: &[u8]) -> Problem {
+    pub(crate) fn mistyped(
+        &self,
+        field: &'static str,
+        expected: &'static str,
+        value: &[u8],
+    ) -> Problem {
         Problem::Mistyped {
             field,
             expected,
@@ -123,7 +128,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    fn as_text(&self, value: &'a [u8]) -> Option<Cow<'a, str>> {
+    pub(crate) fn as_text(&self, value: &'a [u8]) -> Option<Cow<'a, str>> {
         Payload {
             format: self.format,
             bytes: value,
@@ -131,7 +136,7 @@ impl<'a> Fields<'a> {
         .text()
     }
 
-    fn as_number(&self, value: &[u8]) -> Option<f64> {
+    pub(crate) fn as_number(&self, value: &[u8]) -> Option<f64> {
         match self.format {
             Format::Json => {
                 // Rust's parser takes "inf" and "+1" too; JSON does not.
@@ -144,7 +149,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    fn as_integer(&self, value: &[u8]) -> Option<i64> {
+    pub(crate) fn as_integer(&self, value: &[u8]) -> Option<i64> {
         let exact = match self.format {
             Format::Json => std::str::from_utf8(value)
                 .ok()
@@ -213,10 +218,17 @@ impl<'a> Fields<'a> {
         let Some(value) = self.get(field) else {
             return Ok(None);
         };
+        match self.as_boolean(value) {
+            None => Err(self.mistyped(field, "true or false", value)),
+            known => Ok(known),
+        }
+    }
+
+    pub(crate) fn as_boolean(&self, value: &[u8]) -> Option<bool> {
         match (self.format, value) {
-            (Format::Json, b"true") | (Format::Cbor, [0xf5]) => Ok(Some(true)),
-            (Format::Json, b"false") | (Format::Cbor, [0xf4]) => Ok(Some(false)),
-            _ => Err(self.mistyped(field, "true or false", value)),
+            (Format::Json, b"true") | (Format::Cbor, [0xf5]) => Some(true),
+            (Format::Json, b"false") | (Format::Cbor, [0xf4]) => Some(false),
+            _ => None,
         }
     }
 

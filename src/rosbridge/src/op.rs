@@ -5,8 +5,8 @@ use std::borrow::Cow;
 use crate::fields::Fields;
 use crate::{
     ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService,
-    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, SendActionGoal,
-    ServiceResponse, SetLevel, Status, Subscribe, Unadvertise, UnadvertiseAction,
+    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, Qos,
+    SendActionGoal, ServiceResponse, SetLevel, Status, Subscribe, Unadvertise, UnadvertiseAction,
     UnadvertiseService, Unsubscribe, Writer,
 };
 
@@ -211,11 +211,14 @@ pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
     let Some(known) = op.as_deref().and_then(fields_of) else {
         return Vec::new();
     };
-    fields
+    let names = fields
         .names()
-        .filter(|name| !matches!(*name, "op" | "id") && !known.contains(name))
-        .map(str::to_owned)
-        .collect()
+        .filter(|name| !matches!(*name, "op" | "id") && !known.contains(name));
+    let mut unknown: Vec<String> = names.map(str::to_owned).collect();
+    if known.contains(&"qos") {
+        unknown.extend(Qos::unknown(&fields));
+    }
+    unknown
 }
 
 #[cfg(test)]
@@ -342,5 +345,7 @@ pub(crate) mod tests {
         let frame = Frame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
         assert!(Op::parse(frame).is_ok());
         assert_eq!(unknown_fields(frame), ["trottle_rate"]);
+        let within = r#"{"op":"subscribe","topic":"/x","qos":{"depth":5,"reliabilty":"reliable"}}"#;
+        assert_eq!(unknown_fields(Frame::Text(within)), ["qos.reliabilty"]);
     }
 }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Compression, Format, Id, Payload, Problem, Writer};
+use crate::{Compression, Format, Id, Payload, Problem, Qos, Writer};
 
 /// "Here is a message."
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,6 +21,8 @@ pub struct Publish<'a> {
     pub latch: bool,
     /// `package/Type`, where the client has not advertised (extension).
     pub type_name: Option<Cow<'a, str>>,
+    /// What the client offers, where it has not advertised.
+    pub qos: Option<Qos>,
 }
 
 impl<'a> Publish<'a> {
@@ -52,8 +54,15 @@ impl<'a> Publish<'a> {
 
 impl<'a> Message<'a> for Publish<'a> {
     const OP: &'static str = "publish";
-    const FIELDS: &'static [&'static str] =
-        &["topic", "msg", "compression", "latch", "type", "queue_size"];
+    const FIELDS: &'static [&'static str] = &[
+        "topic",
+        "msg",
+        "compression",
+        "latch",
+        "type",
+        "queue_size",
+        "qos",
+    ];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
@@ -63,6 +72,7 @@ impl<'a> Message<'a> for Publish<'a> {
             compression: Compression::read(fields)?,
             latch: fields.boolean("latch")?.unwrap_or(false),
             type_name: fields.text("type", "a message type such as \"std_msgs/String\"")?,
+            qos: Qos::read(fields)?,
         })
     }
 
@@ -77,6 +87,7 @@ impl<'a> Message<'a> for Publish<'a> {
         if self.latch {
             writer.boolean("latch", true);
         }
+        Qos::write(self.qos, writer);
         writer.payload("msg", self.msg);
     }
 }
@@ -95,6 +106,7 @@ mod tests {
             compression: Compression::None,
             latch: false,
             type_name: None,
+            qos: None,
         }
     }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Id, Problem, Writer};
+use crate::{Id, Problem, Qos, Writer};
 
 /// How payloads travel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
@@ -85,6 +85,8 @@ pub struct Subscribe<'a> {
     pub fragment_size: Option<usize>,
     /// How messages are encoded.
     pub compression: Compression,
+    /// What the client asks of the topic.
+    pub qos: Option<Qos>,
 }
 
 impl<'a> Message<'a> for Subscribe<'a> {
@@ -96,6 +98,7 @@ impl<'a> Message<'a> for Subscribe<'a> {
         "queue_length",
         "fragment_size",
         "compression",
+        "qos",
     ];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
@@ -113,6 +116,7 @@ impl<'a> Message<'a> for Subscribe<'a> {
             queue_length: usize::try_from(length.unwrap_or(0)).unwrap_or(usize::MAX),
             fragment_size: fragment_size(fields)?,
             compression: Compression::read(fields)?,
+            qos: Qos::read(fields)?,
         })
     }
 
@@ -131,6 +135,7 @@ impl<'a> Message<'a> for Subscribe<'a> {
         }
         writer.optional_count("fragment_size", self.fragment_size.map(|size| size as u64));
         self.compression.write(writer);
+        Qos::write(self.qos, writer);
     }
 }
 
@@ -177,6 +182,7 @@ mod tests {
             queue_length: 2,
             fragment_size: Some(10_000),
             compression: Compression::CborRaw,
+            qos: None,
         }
     }
 

@@ -153,6 +153,14 @@ impl<'o> Writer<'o> {
         write(self.out)
     }
 
+    /// An object field, whose fields `write` writes.
+    pub fn object(&mut self, key: &str, write: impl FnOnce(&mut Writer<'_>)) {
+        self.key(key);
+        let mut inner = Writer::new(self.out, self.format);
+        write(&mut inner);
+        inner.end();
+    }
+
     /// The payload of `cbor-raw`: a serialized message and when it was received.
     pub fn raw(&mut self, key: &str, stamp: Option<(u32, u32)>, bytes: &[u8]) {
         self.key(key);

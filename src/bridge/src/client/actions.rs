@@ -8,13 +8,14 @@ mod server;
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use ros::bus::RosVersion;
 use ros::schema::ActionDef;
 use rosbridge::Id;
 use tokio_util::sync::CancellationToken;
 
 use super::{Client, take_chosen};
 use crate::lacking::explain;
-use crate::names::plain_type;
+use crate::names::sought;
 use goals::ActionClient;
 use server::ActionServer;
 
@@ -66,15 +67,14 @@ impl Actions {
 
 impl Client {
     fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, String> {
-        let name = plain_type(type_name);
+        let name = sought(self.version(), type_name);
         let registry = &self.shared.registry;
-        // ROS 1 clients write NameAction as well as Name.
-        let def = registry
-            .action(&name)
-            .or_else(|error| match name.strip_suffix("Action") {
-                Some(short) => registry.action(short),
-                None => Err(error),
-            });
-        def.map_err(|error| format!("action {action}: {}", explain(error)))
+        let def = registry.action(&name);
+        let def = def.or_else(|error| match name.strip_suffix("Action") {
+            // Clients of ROS 1 write NameAction as well as Name.
+            Some(short) if self.version() == RosVersion::One => registry.action(short),
+            _ => Err(error),
+        });
+        def.map_err(|error| format!("action {action}: {}", explain(self.version(), error)))
     }
 }

@@ -7,15 +7,15 @@ use std::time::{Duration, Instant};
 
 use access::Operation;
 use bytes::Bytes;
-use ros::bus::Digest;
+use ros::bus::{Digest, ServiceType};
 use ros::codec::{self, CborOptions, JsonOptions};
 use ros::schema::{MessageType, ServiceDef};
 use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
 
-use super::publishing::decode_args;
+use super::decoding::decode_args;
 use super::{Client, Reply, print_format};
 use crate::lacking::explain;
-use crate::names::resolve;
+use crate::names::digest_word;
 use crate::own::{self, OwnService};
 use crate::sample::Frame;
 
@@ -73,14 +73,16 @@ impl Client {
             compression,
             fragment_size: op.fragment_size,
         };
-        let (service, guard) =
-            match resolve(&op.service).and_then(|service| Ok((service, self.begin(args)?))) {
-                Ok(found) => found,
-                Err(reason) => {
-                    self.call_failed(&call, &reason);
-                    return Ok(());
-                }
-            };
+        let (service, guard) = match self
+            .resolve(&op.service)
+            .and_then(|service| Ok((service, self.begin(args)?)))
+        {
+            Ok(found) => found,
+            Err(reason) => {
+                self.call_failed(&call, &reason);
+                return Ok(());
+            }
+        };
         let call = Call {
             service: service.into_owned(),
             ..call
@@ -129,16 +131,16 @@ impl Client {
             .shared
             .registry
             .service(&service_type.name)
-            .map_err(explain);
-        let def = def.and_then(
-            |def| match service_type.digest.agrees(&Digest::from(&def.md5)) {
-                true => Ok(def),
-                false => Err(format!(
-                    "service {} has type {} with MD5 {} there and {} here",
-                    call.service, def.name, service_type.digest, def.md5
-                )),
-            },
-        );
+            .map_err(|error| explain(self.version(), error));
+        let def = def.and_then(|def| match differing(&service_type, &def) {
+            None => Ok(def),
+            Some((theirs, ours)) => Err(format!(
+                "service {} has type {} with {} {theirs} there and {ours} here",
+                call.service,
+                def.name,
+                digest_word(self.version()),
+            )),
+        });
         if let Ok(def) = &def {
             self.report_surplus(&call.reply(), "call_service", &def.request, call.args());
         }
@@ -208,7 +210,7 @@ impl Client {
         if own.shows_graph() {
             self.is_registered().await;
         }
-        let def = own.definition(&self.shared.registry)?;
+        let def = own.definition(&self.shared)?;
         let args = self.own_args(call, &def)?;
         let grants = self.granted().grants();
         let values = own.answer(&self.shared, &args, &grants).await?;
@@ -309,6 +311,16 @@ impl Client {
         writer.end();
         self.send_frame(Frame::new(format, out), call.fragment_size, true);
     }
+}
+
+/// The digests, there and here, by which a server's type is another than the one that is known: of the service, or of its
+/// requests or responses, whichever the server tells.
+fn differing(theirs: &ServiceType, def: &ServiceDef) -> Option<(Digest, Digest)> {
+    let ours = ServiceType::of(def);
+    let told = [&theirs.digest, &theirs.request, &theirs.response];
+    let known = [ours.digest, ours.request, ours.response];
+    let mut pairs = told.into_iter().cloned().zip(known);
+    pairs.find(|(theirs, ours)| !theirs.agrees(ours))
 }
 
 fn answer_frame<E>(

@@ -1,28 +1,25 @@
 //! `advertise`, `unadvertise`, `publish`.
 
 use std::collections::{HashMap, HashSet};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 use access::Operation;
 use bytes::Bytes;
-use ros::codec::{self, FillOptions, Time};
 use ros::schema::MessageType;
 use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Unadvertise};
 
+use super::decoding::decode;
 use super::{Client, Reply, take_chosen};
 use crate::lacking::explain;
-use crate::names::{plain_type, resolve};
+use crate::names::{digest_word, is_same_type, sought, spelled};
+use crate::quality::{Offer, offered};
 use crate::tf;
-use crate::topic_publisher::TopicPublisher;
+use crate::topic_publisher::{Notified, TopicPublisher};
 
 /// Messages on one topic that wait until its type is known.
 const MAX_UNTYPED: usize = 64;
 /// Bytes of all such messages of one client; one message may have more.
 const MAX_UNTYPED_BYTES: usize = 16 << 20;
-/// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
-const SLICED: usize = 16 * 1024;
-/// Messages kept per slow node where the client does not say.
-const DEFAULT_QUEUE: u64 = 100;
 
 /// A client's topics, by their absolute names.
 #[derive(Default)]
@@ -60,11 +57,36 @@ impl TopicPublishers {
     }
 }
 
+/// Passes on to a client what it must know of a topic that it publishes.
+struct Advertiser {
+    client: Weak<Client>,
+    topic: String,
+    reply: Reply,
+}
+
+impl Notified for Advertiser {
+    fn failed(&self, reason: &str) {
+        if let Some(client) = self.client.upgrade() {
+            let gone = client.topic_publishers.lock().open.remove(&self.topic);
+            drop(gone);
+            self.refused(reason);
+        }
+    }
+
+    fn refused(&self, reason: &str) {
+        if let Some(client) = self.client.upgrade() {
+            let text = format!("advertise: topic {}: {reason}", self.topic);
+            client.error(&self.reply, &text);
+        }
+    }
+}
+
 /// A message whose topic's type is being asked for.
 struct Untyped {
     format: Format,
     payload: Bytes,
     compression: Compression,
+    offer: Offer,
     reply: Reply,
 }
 
@@ -74,31 +96,34 @@ impl Client {
         op: &Advertise<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let topic = resolve(&op.topic)?;
+        let topic = self.resolve(&op.topic)?;
         self.granted().check(Operation::Publish, &topic)?;
         let message_type = self
             .publishable_type(&topic, &op.type_name)
             .inspect_err(|_| {
                 self.note_told(&topic);
             })?;
-        if let Some(md5) = op
+        if let Some(digest) = op
             .md5sum
             .as_deref()
-            .filter(|md5| *md5 != "*" && *md5 != message_type.md5())
+            .filter(|digest| *digest != "*" && *digest != message_type.digest())
         {
             return Err(format!(
-                "type {} has MD5 {} here and {md5} there; use the definition that /rosapi/message_details shows",
+                "type {} has {} {} here and {digest} there; use the definition that /rosapi/message_details shows",
                 message_type.name(),
-                message_type.md5()
+                digest_word(self.version()),
+                message_type.digest()
             ));
         }
-        self.open_outlet(&topic, message_type, op.latch, op.queue_size, reply, true)?;
+        let offer = offered(self.version(), op.qos, op.latch, op.queue_size);
+        self.open_outlet(&topic, message_type, offer, reply, true)?;
+        self.report_unheard("advertise", op.qos, false, reply);
         self.info(reply, &format!("advertise: advertised {topic}"));
         Ok(())
     }
 
     pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &Reply) -> Result<(), String> {
-        let topic = resolve(&op.topic)?;
+        let topic = self.resolve(&op.topic)?;
         let mut topic_publishers = self.topic_publishers.lock();
         topic_publishers.told.remove(&*topic);
         let known = topic_publishers.open.get_mut(&*topic);
@@ -131,21 +156,22 @@ impl Client {
 
     /// The type by that name, if the topic may be published with it.
     fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, String> {
-        let name = plain_type(type_name);
+        let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
         let theirs = graph
             .topics
             .get(topic)
             .map(|nodes| nodes.type_name.as_str());
-        if let Some(theirs) =
-            theirs.filter(|theirs| !matches!(*theirs, "" | "*") && *theirs != name)
-        {
+        let other =
+            |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
+        if let Some(theirs) = theirs.filter(other) {
+            let name = spelled(version, type_name);
             return Err(format!("topic {topic} has type {theirs}, not {name}"));
         }
         self.shared
             .registry
-            .message(&name)
-            .map_err(|error| format!("topic {topic}: {}", explain(error)))
+            .message(&sought(version, type_name))
+            .map_err(|error| format!("topic {topic}: {}", explain(version, error)))
     }
 
     /// The client is being told why nothing can be published on a topic. Gives whether it had been before.
@@ -171,8 +197,7 @@ impl Client {
         self: &Arc<Self>,
         topic: &str,
         message_type: Arc<MessageType>,
-        latch: bool,
-        queue_size: Option<u64>,
+        offer: Offer,
         reply: &Reply,
         advertised: bool,
     ) -> Result<Arc<TopicPublisher>, String> {
@@ -184,7 +209,7 @@ impl Client {
         let count = topic_publishers.count();
         let known = topic_publishers.open.get_mut(topic);
         if let Some(known) = &known
-            && known.topic_publisher.message_type.md5() != message_type.md5()
+            && known.topic_publisher.message_type.digest() != message_type.digest()
         {
             let known = known.topic_publisher.message_type.name();
             return Err(format!(
@@ -201,7 +226,7 @@ impl Client {
         }
         let mut ids = HashSet::new();
         if let Some(known) = known {
-            if known.topic_publisher.latch == latch || !advertised {
+            if known.topic_publisher.offer == offer || !advertised {
                 known.ids.extend(id);
                 return Ok(known.topic_publisher.clone());
             }
@@ -209,22 +234,16 @@ impl Client {
         }
         ids.extend(id);
         topic_publishers.told.remove(topic);
-        let queue = queue_size
-            .filter(|size| *size > 0)
-            .unwrap_or(DEFAULT_QUEUE)
-            .min(1000) as usize;
-        let (client, reply, name) = (Arc::downgrade(self), reply.clone(), topic.to_owned());
-        let failed = move |reason: String| {
-            if let Some(client) = client.upgrade() {
-                client.topic_publishers.lock().open.remove(&name);
-                client.error(&reply, &format!("advertise: topic {name}: {reason}"));
-            }
-        };
+        let notified = Arc::new(Advertiser {
+            client: Arc::downgrade(self),
+            topic: topic.to_owned(),
+            reply: reply.clone(),
+        });
         if topic == tf::GOAL_TOPIC {
             self.shared.republisher.listen(&self.shared);
         }
         let topic_publisher =
-            TopicPublisher::open(&self.shared, topic, message_type, latch, queue, failed);
+            TopicPublisher::open(&self.shared, topic, message_type, offer, notified);
         let opened = Advertised {
             topic_publisher: topic_publisher.clone(),
             ids,
@@ -241,7 +260,7 @@ impl Client {
         reply: &Reply,
         source: Option<&Bytes>,
     ) -> Result<(), String> {
-        let topic = resolve(&op.topic)?;
+        let topic = self.resolve(&op.topic)?;
         let known = self
             .topic_publishers
             .lock()
@@ -256,7 +275,8 @@ impl Client {
                 .and_then(|()| self.type_to_publish(&topic, &op))
             {
                 Ok(Some(message_type)) => {
-                    self.open_outlet(&topic, message_type, op.latch, None, reply, false)?
+                    let offer = offered(self.version(), op.qos, op.latch, None);
+                    self.open_outlet(&topic, message_type, offer, reply, false)?
                 }
                 Ok(None) => return self.publish_later(&topic, &op, reply),
                 Err(reason) => return self.report_once(&topic, reason),
@@ -335,6 +355,7 @@ impl Client {
             format: op.msg.format,
             payload: Bytes::copy_from_slice(op.msg.bytes),
             compression: op.compression,
+            offer: offered(self.version(), op.qos, op.latch, None),
             reply: reply.clone(),
         };
         let mut topic_publishers = self.topic_publishers.lock();
@@ -381,8 +402,7 @@ impl Client {
                     let topic_publisher = client.open_outlet(
                         &topic,
                         message_type,
-                        false,
-                        None,
+                        message.offer,
                         &message.reply,
                         false,
                     )?;
@@ -406,67 +426,5 @@ impl Client {
             }
         });
         Ok(())
-    }
-}
-
-/// A payload as serialized message.
-pub(super) fn decode(
-    message_type: &MessageType,
-    payload: Payload<'_>,
-    compression: Compression,
-    source: Option<&Bytes>,
-) -> Result<Bytes, String> {
-    if compression == Compression::CborRaw {
-        let raw = payload.raw().map_err(|error| error.to_string())?;
-        codec::validate(message_type, &raw.bytes).map_err(|error| error.to_string())?;
-        return Ok(match (&raw.bytes, source) {
-            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
-                source.slice_ref(slice)
-            }
-            _ => Bytes::from(raw.bytes.into_owned()),
-        });
-    }
-    let options = FillOptions {
-        now: Some(Time::now()),
-        ..FillOptions::default()
-    };
-    // Base64 shrinks by a quarter; everything else that matters does by more.
-    let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
-    let decoded = match payload.format {
-        Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
-        Format::Cbor => codec::from_cbor(message_type, payload.bytes, &mut out, &options),
-    };
-    decoded.map_err(|error| error.to_string())?;
-    Ok(Bytes::from(out))
-}
-
-/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults, and what a list
-/// has too many is left out.
-pub(super) fn decode_args(
-    message_type: &MessageType,
-    args: Option<Payload<'_>>,
-    compression: Compression,
-) -> Result<Bytes, String> {
-    match args {
-        None if compression == Compression::CborRaw && message_type.min_size() > 0 => {
-            Err("field \"args\" is missing, the ROS serialization is expected".to_owned())
-        }
-        None => decode(message_type, Payload::json("{}"), Compression::None, None),
-        Some(list) if list.is_list() && compression != Compression::CborRaw => {
-            let fields = message_type.fields();
-            let named = list
-                .named(fields.iter().map(|field| field.name.as_str()))
-                .ok_or("field \"args\" is a list of too many values; name them in an object")?;
-            decode(
-                message_type,
-                Payload {
-                    format: list.format,
-                    bytes: &named,
-                },
-                compression,
-                None,
-            )
-        }
-        Some(args) => decode(message_type, args, compression, None),
     }
 }

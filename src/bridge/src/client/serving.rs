@@ -12,10 +12,10 @@ use rosbridge::{AdvertiseService, Compression, Id, ServiceResponse, UnadvertiseS
 use tokio::sync::{oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::publishing::decode_args;
+use super::decoding::decode_args;
 use super::{Client, Reply, print_format, take_chosen};
 use crate::lacking::explain;
-use crate::names::{plain_type, resolve};
+use crate::names::sought;
 use crate::sample::Frame;
 
 /// What a client serves, and the calls it has not answered yet.
@@ -147,13 +147,13 @@ impl Client {
         op: &AdvertiseService<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let service = resolve(&op.service)?.into_owned();
+        let service = self.resolve(&op.service)?.into_owned();
         self.granted().check(Operation::Advertise, &service)?;
         let def = self
             .shared
             .registry
-            .service(&plain_type(&op.type_name))
-            .map_err(|error| format!("service {service}: {}", explain(error)))?;
+            .service(&sought(self.version(), &op.type_name))
+            .map_err(|error| format!("service {service}: {}", explain(self.version(), error)))?;
         let limit = self.shared.options.max_advertisements;
         let number = self.shared.next_number();
         let stop = CancellationToken::new();
@@ -259,7 +259,7 @@ impl Client {
         op: &UnadvertiseService<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let service = resolve(&op.service)?;
+        let service = self.resolve(&op.service)?;
         let mut services = self.services.lock();
         let gone = services.served.remove(&*service);
         let unanswered: Vec<_> = services
@@ -302,7 +302,7 @@ impl Client {
     }
 
     pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), String> {
-        let service = resolve(&op.service)?;
+        let service = self.resolve(&op.service)?;
         let id = op
             .id
             .as_ref()

@@ -5,13 +5,16 @@ use std::sync::{Arc, Weak};
 use std::time::Instant;
 
 use access::Operation;
+use ros::bus::{Qos, RosVersion};
+use ros::schema::MessageType;
 use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 
 use super::{Client, Reply};
 use crate::fanout::{Listener, Listening};
 use crate::lacking::explain;
-use crate::names::{plain_type, resolve};
+use crate::names::{is_same_type, sought, spelled};
 use crate::outbox::{Outbox, TopicKey};
+use crate::quality::{asked, most, queue_length};
 use crate::sample::Sample;
 use crate::topic_queue::{Subscriptions, Wishes};
 
@@ -21,6 +24,10 @@ pub(super) type Subscribed = HashMap<Arc<str>, TopicSubscription>;
 pub(super) struct TopicSubscription {
     key: TopicKey,
     subscriptions: Subscriptions,
+    /// What each of them asks of publishers.
+    asked: HashMap<Option<Id<'static>>, Qos>,
+    /// The topic's type, where it was known.
+    expected: Option<Arc<MessageType>>,
     listening: Listening,
     listener: Arc<TopicListener>,
 }
@@ -50,7 +57,7 @@ impl TopicListener {
     fn misfit<'s>(&self, sample: &'s Sample) -> Option<&'s str> {
         let offered = sample.wire_type.name.as_str();
         let wanted = self.wanted.as_deref()?;
-        (wanted != offered && offered != "*").then_some(offered)
+        (offered != "*" && !is_same_type(wanted, offered)).then_some(offered)
     }
 }
 
@@ -78,6 +85,10 @@ impl Listener for TopicListener {
             client.status(Level::Error, self.id.clone(), self.format, &text);
         }
     }
+
+    fn refused(&self, reason: &str) {
+        self.failed(reason);
+    }
 }
 
 impl Client {
@@ -86,20 +97,21 @@ impl Client {
         op: Subscribe<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let name = resolve(&op.topic)?;
+        let name = self.resolve(&op.topic)?;
         self.granted().check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
         let wishes = Wishes {
             throttle_rate: op.throttle_rate,
-            queue_length: op.queue_length,
+            queue_length: queue_length(&op),
             fragment_size: op.fragment_size,
             compression: op.compression,
         };
+        let qos = asked(op.qos, self.shared.options.bus_queue);
         let wanted = op
             .type_name
             .as_deref()
             .filter(|name| *name != "*")
-            .map(|name| plain_type(name).into_owned());
+            .map(|name| spelled(self.version(), name).into_owned());
         let limit = self.shared.options.max_subscriptions;
         let mut subscribed = self.subscriptions.lock();
         let all: usize = subscribed
@@ -116,15 +128,17 @@ impl Client {
         }
         if let Some(known) = subscribed.get_mut(&*op.topic) {
             if let (Some(wanted), Some(earlier)) = (&wanted, &known.listener.wanted)
-                && wanted != earlier
+                && !is_same_type(wanted, earlier)
             {
                 return Err(format!(
                     "this client subscribes to {name} as {earlier}, not {wanted}; unsubscribe from it first"
                 ));
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
-            self.apply_wishes(known);
-            known.listening.fanout().replay(known.listener.as_ref());
+            known.asked.insert(reply.id.clone(), qos);
+            if !self.apply_wishes(known) {
+                known.listening.fanout().replay(known.listener.as_ref());
+            }
         } else {
             let topic: Arc<str> = op.topic.as_ref().into();
             let key = self.outbox.add_topic(topic.clone(), wishes);
@@ -138,7 +152,7 @@ impl Client {
                 id: reply.id.clone(),
                 format: reply.format,
             });
-            let fanout = self.shared.fanout(&name, expected.as_deref());
+            let fanout = self.shared.fanout_of(&name, expected.as_deref(), qos);
             let listening = fanout.listen(listener.clone());
             let subscriptions = Subscriptions::from([(reply.id.clone(), wishes)]);
             subscribed.insert(
@@ -146,12 +160,15 @@ impl Client {
                 TopicSubscription {
                     key,
                     subscriptions,
+                    asked: HashMap::from([(reply.id.clone(), qos)]),
+                    expected,
                     listening,
                     listener,
                 },
             );
         }
         drop(subscribed);
+        self.report_unheard("subscribe", op.qos, true, reply);
         self.info(reply, &format!("subscribe: subscribed to {name}"));
         Ok(())
     }
@@ -161,7 +178,8 @@ impl Client {
         &self,
         topic: &str,
         op: &Subscribe<'_>,
-    ) -> Result<Option<Arc<ros::schema::MessageType>>, String> {
+    ) -> Result<Option<Arc<MessageType>>, String> {
+        let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
         let nodes = graph.topics.get(topic);
         let actual = nodes
@@ -169,38 +187,47 @@ impl Client {
             .filter(|name| !name.is_empty() && *name != "*");
         let local = self.shared.local_type(topic);
         let actual = actual.or(local.as_deref());
-        let wanted = op
-            .type_name
-            .as_deref()
-            .filter(|name| *name != "*")
-            .map(plain_type);
-        match (&wanted, actual) {
+        let wanted = op.type_name.as_deref().filter(|name| *name != "*");
+        match (wanted, actual) {
             (None, None) if nodes.is_none() => {
                 return Err(format!(
                     "topic {topic} does not exist; say its \"type\" to wait for it, /rosapi/topics lists those that do"
                 ));
             }
-            (Some(wanted), Some(actual)) if *wanted != plain_type(actual) => {
+            (Some(wanted), Some(actual)) if !is_same_type(wanted, actual) => {
+                let wanted = spelled(version, wanted);
                 return Err(format!("topic {topic} has type {actual}, not {wanted}"));
             }
             _ => {}
         }
-        let Some(name) = wanted.or(actual.map(plain_type)) else {
+        let is_published = nodes.is_some_and(|nodes| !nodes.publishers.is_empty());
+        // As the servant writes it, where it does.
+        let Some(name) = actual.or(wanted) else {
             return Ok(None);
         };
-        match self.shared.registry.message(&name) {
+        match self.shared.registry.message(&sought(version, name)) {
             Ok(found) => Ok(Some(found)),
-            // A publisher brings the definition along, and for ROS bytes none is needed.
+            // For ROS bytes none is needed, and a publisher of ROS 1 brings its own along.
             Err(_) if op.compression == Compression::CborRaw => Ok(None),
-            Err(_) if nodes.is_some_and(|nodes| !nodes.publishers.is_empty()) => Ok(None),
-            Err(error) => Err(format!("topic {topic}: {}", explain(error))),
+            Err(_) if version == RosVersion::One && is_published => Ok(None),
+            Err(error) => Err(format!("topic {topic}: {}", explain(version, error))),
         }
     }
 
-    fn apply_wishes(&self, known: &TopicSubscription) {
+    /// Gives the topic what its subscriptions want together. Whether it is listened to anew, and so hears what was kept.
+    fn apply_wishes(&self, known: &mut TopicSubscription) -> bool {
         if let Some(merged) = Wishes::merged(known.subscriptions.values()) {
             self.outbox.change_topic(known.key, merged);
         }
+        let fanout = known.listening.fanout();
+        let asked = most(known.asked.values());
+        let Some(qos) = asked.filter(|qos| !fanout.serves(qos)) else {
+            return false;
+        };
+        let expected = known.expected.as_deref();
+        let fanout = self.shared.fanout_of(&fanout.topic, expected, qos);
+        known.listening = fanout.listen(known.listener.clone());
+        true
     }
 
     pub(super) fn unsubscribe(&self, op: &Unsubscribe<'_>, reply: &Reply) -> Result<(), String> {
@@ -219,6 +246,7 @@ impl Client {
         let gone = match &reply.id {
             None => true,
             id => {
+                known.asked.remove(id);
                 if known.subscriptions.remove(id).is_none() {
                     self.warn(
                         reply,

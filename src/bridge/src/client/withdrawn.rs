@@ -4,7 +4,6 @@ use access::{Grants, Operation};
 use rosbridge::{Format, Level};
 
 use super::Client;
-use crate::names::resolve;
 
 impl Client {
     /// Takes back what is not granted any more, and tells the client what. Calls that nodes work on already are answered.
@@ -28,7 +27,10 @@ impl Client {
         let mut subscriptions = self.subscriptions.lock();
         let written: Vec<_> = subscriptions
             .keys()
-            .filter(|topic| resolve(topic).is_ok_and(|name| lacks(Operation::Subscribe, &name)))
+            .filter(|topic| {
+                let name = self.resolve(topic);
+                name.is_ok_and(|name| lacks(Operation::Subscribe, &name))
+            })
             .cloned()
             .collect();
         let gone: Vec<_> = written

@@ -1,19 +1,25 @@
 //! The definitions of rosapi's services, so that they can be called in CBOR and ROS bytes as well, and be asked for
-//! like any other service's.
+//! like any other service's. They are the union of what rosapi offers in ROS 1 and in ROS 2 (Jazzy).
 
 use std::sync::OnceLock;
 
+use ros::bus::RosVersion;
 use ros::schema::Registry;
 
-/// Name below `/rosapi/` and type below `rosapi/`.
+/// Name below `/rosapi/` and name of the type in its package.
 pub(super) const SERVICES: &[(&str, &str)] = &[
+    ("action_feedback_details", "ActionFeedbackDetails"),
+    ("action_goal_details", "ActionGoalDetails"),
+    ("action_result_details", "ActionResultDetails"),
     ("action_servers", "GetActionServers"),
+    ("action_type", "ActionType"),
     ("delete_param", "DeleteParam"),
     ("get_param", "GetParam"),
     ("get_param_names", "GetParamNames"),
     ("get_ros_version", "GetROSVersion"),
     ("get_time", "GetTime"),
     ("has_param", "HasParam"),
+    ("interfaces", "Interfaces"),
     ("message_details", "MessageDetails"),
     ("node_details", "NodeDetails"),
     ("nodes", "Nodes"),
@@ -35,101 +41,113 @@ pub(super) const SERVICES: &[(&str, &str)] = &[
     ("topics_for_type", "TopicsForType"),
 ];
 
+const TYPE_DEF: &str = "string type\nstring[] fieldnames\nstring[] fieldtypes\nint32[] fieldarraylen\nstring[] examples\n\
+     string[] constnames\nstring[] constvalues\n";
+
+const DETAILS: &str = "string type\n---\nTypeDef[] typedefs\n";
+
+/// Services that are the same in both ROSes, by the names of their types.
 const TEXTS: &[(&str, &str)] = &[
+    ("ActionFeedbackDetails", DETAILS),
+    ("ActionGoalDetails", DETAILS),
+    ("ActionResultDetails", DETAILS),
+    ("ActionType", "string action\n---\nstring type\n"),
+    ("GetActionServers", "---\nstring[] action_servers\n"),
+    ("GetParamNames", "---\nstring[] names\n"),
+    ("GetROSVersion", "---\nuint8 version\nstring distro\n"),
+    ("HasParam", "string name\n---\nbool exists\n"),
+    ("Interfaces", "---\nstring[] interfaces\n"),
+    ("MessageDetails", DETAILS),
     (
-        "rosapi/msg/TypeDef",
-        "string type\nstring[] fieldnames\nstring[] fieldtypes\nint32[] fieldarraylen\nstring[] examples\n\
-         string[] constnames\nstring[] constvalues\n",
-    ),
-    (
-        "rosapi/srv/GetActionServers",
-        "---\nstring[] action_servers\n",
-    ),
-    ("rosapi/srv/DeleteParam", "string name\n---\n"),
-    (
-        "rosapi/srv/GetParam",
-        "string name\nstring default\n---\nstring value\n",
-    ),
-    ("rosapi/srv/GetParamNames", "---\nstring[] names\n"),
-    (
-        "rosapi/srv/GetROSVersion",
-        "---\nuint8 version\nstring distro\n",
-    ),
-    ("rosapi/srv/GetTime", "---\ntime time\n"),
-    ("rosapi/srv/HasParam", "string name\n---\nbool exists\n"),
-    (
-        "rosapi/srv/MessageDetails",
-        "string type\n---\nTypeDef[] typedefs\n",
-    ),
-    (
-        "rosapi/srv/NodeDetails",
+        "NodeDetails",
         "string node\n---\nstring[] subscribing\nstring[] publishing\nstring[] services\n",
     ),
-    ("rosapi/srv/Nodes", "---\nstring[] nodes\n"),
+    ("Nodes", "---\nstring[] nodes\n"),
+    ("Publishers", "string topic\n---\nstring[] publishers\n"),
+    ("SearchParam", "string name\n---\nstring global_name\n"),
+    ("ServiceHost", "string service\n---\nstring host\n"),
+    ("ServiceNode", "string service\n---\nstring node\n"),
     (
-        "rosapi/srv/Publishers",
-        "string topic\n---\nstring[] publishers\n",
-    ),
-    (
-        "rosapi/srv/SearchParam",
-        "string name\n---\nstring global_name\n",
-    ),
-    (
-        "rosapi/srv/ServiceHost",
-        "string service\n---\nstring host\n",
-    ),
-    (
-        "rosapi/srv/ServiceNode",
-        "string service\n---\nstring node\n",
-    ),
-    (
-        "rosapi/srv/ServiceProviders",
+        "ServiceProviders",
         "string service\n---\nstring[] providers\n",
     ),
+    ("ServiceRequestDetails", DETAILS),
+    ("ServiceResponseDetails", DETAILS),
+    ("ServiceType", "string service\n---\nstring type\n"),
+    ("Services", "---\nstring[] services\n"),
+    ("ServicesForType", "string type\n---\nstring[] services\n"),
+    ("Subscribers", "string topic\n---\nstring[] subscribers\n"),
+    ("TopicType", "string topic\n---\nstring type\n"),
+    ("Topics", "---\nstring[] topics\nstring[] types\n"),
     (
-        "rosapi/srv/ServiceRequestDetails",
-        "string type\n---\nTypeDef[] typedefs\n",
-    ),
-    (
-        "rosapi/srv/ServiceResponseDetails",
-        "string type\n---\nTypeDef[] typedefs\n",
-    ),
-    (
-        "rosapi/srv/ServiceType",
-        "string service\n---\nstring type\n",
-    ),
-    ("rosapi/srv/Services", "---\nstring[] services\n"),
-    (
-        "rosapi/srv/ServicesForType",
-        "string type\n---\nstring[] services\n",
-    ),
-    ("rosapi/srv/SetParam", "string name\nstring value\n---\n"),
-    (
-        "rosapi/srv/Subscribers",
-        "string topic\n---\nstring[] subscribers\n",
-    ),
-    ("rosapi/srv/TopicType", "string topic\n---\nstring type\n"),
-    (
-        "rosapi/srv/Topics",
-        "---\nstring[] topics\nstring[] types\n",
-    ),
-    (
-        "rosapi/srv/TopicsAndRawTypes",
+        "TopicsAndRawTypes",
         "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text\n",
     ),
+    ("TopicsForType", "string type\n---\nstring[] topics\n"),
+];
+
+/// Those of ROS 1 alone.
+const OF_ONE: &[(&str, &str)] = &[
+    ("DeleteParam", "string name\n---\n"),
     (
-        "rosapi/srv/TopicsForType",
-        "string type\n---\nstring[] topics\n",
+        "GetParam",
+        "string name\nstring default\n---\nstring value\n",
+    ),
+    ("GetTime", "---\ntime time\n"),
+    ("SetParam", "string name\nstring value\n---\n"),
+];
+
+/// Those of ROS 2 alone. A default of a parameter was dropped by later versions of rosapi, which say instead whether a
+/// parameter was there.
+const OF_TWO: &[(&str, &str)] = &[
+    (
+        "DeleteParam",
+        "string name\n---\nbool successful\nstring reason\n",
+    ),
+    (
+        "GetParam",
+        "string name\nstring default_value\n---\nstring value\nbool successful\nstring reason\n",
+    ),
+    ("GetTime", "---\nbuiltin_interfaces/Time time\n"),
+    (
+        "SetParam",
+        "string name\nstring value\n---\nbool successful\nstring reason\n",
     ),
 ];
 
+/// Where the types of rosapi are.
+fn package(version: RosVersion) -> &'static str {
+    match version {
+        RosVersion::One => "rosapi",
+        RosVersion::Two => "rosapi_msgs",
+    }
+}
+
+/// The full name of a service's type, as its ROS writes it.
+pub(super) fn type_name(version: RosVersion, srv: &str) -> String {
+    let package = package(version);
+    match version {
+        RosVersion::One => format!("{package}/{srv}"),
+        RosVersion::Two => format!("{package}/srv/{srv}"),
+    }
+}
+
 /// rosapi's own definitions.
-pub(super) fn registry() -> &'static Registry {
-    static REGISTRY: OnceLock<Registry> = OnceLock::new();
-    REGISTRY.get_or_init(|| {
-        let registry = Registry::new();
-        for (key, text) in TEXTS {
-            if let Err(error) = registry.insert(key, text) {
+pub(super) fn registry(version: RosVersion) -> &'static Registry {
+    static ONE: OnceLock<Registry> = OnceLock::new();
+    static TWO: OnceLock<Registry> = OnceLock::new();
+    let (registry, own) = match version {
+        RosVersion::One => (&ONE, OF_ONE),
+        RosVersion::Two => (&TWO, OF_TWO),
+    };
+    registry.get_or_init(|| {
+        let package = package(version);
+        let registry = Registry::of(version);
+        let services = TEXTS.iter().chain(own);
+        let services = services.map(|(srv, text)| (format!("{package}/srv/{srv}"), *text));
+        let type_def = (format!("{package}/msg/TypeDef"), TYPE_DEF);
+        for (key, text) in services.chain([type_def]) {
+            if let Err(error) = registry.insert(&key, text) {
                 unreachable!("{key} is well formed: {error}");
             }
         }
@@ -143,14 +161,27 @@ mod tests {
 
     #[test]
     fn every_service_has_its_definition() {
-        assert_eq!(SERVICES.len() + 1, TEXTS.len());
-        for (_, srv) in SERVICES {
-            registry().service(&format!("rosapi/{srv}")).unwrap();
+        for (version, own) in [(RosVersion::One, OF_ONE), (RosVersion::Two, OF_TWO)] {
+            assert_eq!(SERVICES.len(), TEXTS.len() + own.len());
+            for (_, srv) in SERVICES {
+                let name = type_name(version, srv);
+                let found = registry(version).service(&name).unwrap();
+                assert_eq!(found.name, name);
+            }
         }
         // As rosbridge_suite's generated code has it.
         assert_eq!(
-            registry().service("rosapi/Topics").unwrap().md5,
+            registry(RosVersion::One)
+                .service("rosapi/Topics")
+                .unwrap()
+                .md5,
             "d966d98fc333fa1f3135af765eac1ba8"
+        );
+        let two = registry(RosVersion::Two).service("rosapi_msgs/GetTime");
+        let response = two.unwrap().response.clone();
+        assert_eq!(
+            response.fields()[0].type_name,
+            "builtin_interfaces/msg/Time"
         );
     }
 }

@@ -1,17 +1,18 @@
 //! What the graph of nodes, topics and services says.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use access::Grants;
 use futures_util::StreamExt;
 use futures_util::stream;
-use ros::bus::{Graph, TopicNodes};
-use ros::schema::Registry;
+use ros::bus::{Graph, RosVersion, TopicNodes};
+use ros::schema::{MessageType, Registry};
 use serde_json::{Value, json};
 
 use super::{NODE, Service, with_own};
-use crate::names::plain_type;
+use crate::names::{is_same_type, plain_type};
 use crate::shared::Shared;
 use crate::{presence, tf};
 
@@ -19,52 +20,72 @@ use crate::{presence, tf};
 const ASKED_AT_ONCE: usize = 16;
 
 /// Where every node of ROS tells its log, rosapi's included.
-const ROSOUT: (&str, &str) = ("/rosout", "rosgraph_msgs/Log");
+const ROSOUT: &str = "/rosout";
 
 /// Nobody has said yet: rosapi writes it so.
+fn told(type_name: &str) -> &str {
+    if type_name == "*" { "" } else { type_name }
+}
+
 fn type_of(nodes: &TopicNodes) -> &str {
-    if nodes.type_name == "*" {
-        ""
-    } else {
-        &nodes.type_name
-    }
+    told(&nodes.type_name)
 }
 
 /// The graph with the topics that the bridge answers for, unless a node of the servant does.
-pub(super) fn with_own_topics(graph: &Graph) -> Graph {
+pub(super) fn with_own_topics(version: RosVersion, graph: &Graph) -> Graph {
     let mut graph = graph.clone();
     let ours = TopicNodes::default;
-    let republishes = graph
-        .topics
-        .get(tf::STATUS_TOPIC)
-        .is_some_and(|status| !status.publishers.is_empty());
-    if !republishes {
-        for (topic, type_name, published) in tf::TOPICS {
-            let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
-            nodes.type_name = type_name.to_owned();
-            let end = match published {
-                true => &mut nodes.publishers,
-                false => &mut nodes.subscribers,
-            };
-            end.push(NODE.to_owned());
-        }
-        let nodes = graph.actions.entry(tf::ACTION.to_owned()).or_default();
-        nodes.servers.push(NODE.to_owned());
-    }
-    let (topic, type_name) = ROSOUT;
-    let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
+    republishes_transforms(version, &mut graph);
+    let nodes = graph.topics.entry(ROSOUT.to_owned()).or_insert_with(ours);
     if matches!(nodes.type_name.as_str(), "" | "*") {
+        let type_name = match version {
+            RosVersion::One => "rosgraph_msgs/Log",
+            RosVersion::Two => "rcl_interfaces/msg/Log",
+        };
         nodes.type_name = type_name.to_owned();
     }
     nodes.publishers.push(NODE.to_owned());
     for topic in presence::TOPICS {
         let nodes = graph.topics.entry(topic.to_owned()).or_insert_with(ours);
         if nodes.publishers.is_empty() {
-            nodes.type_name = presence::type_name(topic).unwrap_or_default().to_owned();
+            let type_name = presence::type_name(version, topic);
+            nodes.type_name = type_name.unwrap_or_default().to_owned();
             nodes.publishers.push(NODE.to_owned());
         }
     }
     graph
+}
+
+/// Adds the action that sends transforms, unless a node serves it: with its topics, where actions are made of such.
+fn republishes_transforms(version: RosVersion, graph: &mut Graph) {
+    let is_served = match version {
+        RosVersion::One => {
+            let status = graph.topics.get(tf::STATUS_TOPIC);
+            status.is_some_and(|status| !status.publishers.is_empty())
+        }
+        RosVersion::Two => {
+            let action = graph.actions.get(tf::ACTION);
+            action.is_some_and(|action| !action.servers.is_empty())
+        }
+    };
+    if is_served {
+        return;
+    }
+    let nodes = graph.actions.entry(tf::ACTION.to_owned()).or_default();
+    nodes.servers.push(NODE.to_owned());
+    nodes.type_name = tf::action_name(version).to_owned();
+    if version == RosVersion::Two {
+        return;
+    }
+    for (topic, type_name, published) in tf::TOPICS {
+        let nodes = graph.topics.entry(topic.to_owned()).or_default();
+        nodes.type_name = type_name.to_owned();
+        let end = match published {
+            true => &mut nodes.publishers,
+            false => &mut nodes.subscribers,
+        };
+        end.push(NODE.to_owned());
+    }
 }
 
 /// What of the graph a client with these grants is shown: the names that it may do something with, and the nodes behind them.
@@ -96,25 +117,42 @@ pub(super) fn topics(graph: &Graph) -> Value {
 }
 
 pub(super) fn topics_for_type(graph: &Graph, type_name: &str) -> Value {
-    let wanted = plain_type(type_name);
     let topics = graph
         .topics
         .iter()
-        .filter(|(_, nodes)| nodes.type_name == wanted)
+        .filter(|(_, nodes)| is_same_type(&nodes.type_name, type_name))
         .map(|(topic, _)| topic);
     json!({ "topics": topics.collect::<Vec<_>>() })
 }
 
-pub(super) fn topics_and_raw_types(graph: &Graph, registry: &Registry) -> Value {
+pub(super) fn topics_and_raw_types(
+    graph: &Graph,
+    version: RosVersion,
+    registry: &Registry,
+) -> Value {
     let mut answer = topics(graph);
     let texts = graph.topics.values().map(|nodes| {
-        let found = with_own(registry, |registry| registry.message(type_of(nodes)));
-        found
-            .map(|found| found.full_text().to_owned())
-            .unwrap_or_default()
+        let found = with_own(version, registry, |registry| {
+            registry.message(type_of(nodes))
+        });
+        found.map(|found| raw_text(&found)).unwrap_or_default()
     });
     answer["typedefs_full_text"] = texts.collect::<Vec<_>>().into();
     answer
+}
+
+/// A definition with all that it contains, whose names are written `package/Type` in either ROS.
+fn raw_text(message: &MessageType) -> String {
+    let text = message.full_text();
+    if message.version() == RosVersion::One {
+        return text.to_owned();
+    }
+    let lines = text.split_inclusive('\n');
+    let lines = lines.map(|line| match line.strip_prefix("MSG: ") {
+        Some(name) => Cow::Owned(format!("MSG: {}", plain_type(name))),
+        None => Cow::Borrowed(line),
+    });
+    lines.collect()
 }
 
 pub(super) fn topic_type(graph: &Graph, topic: &str) -> Value {
@@ -156,7 +194,14 @@ pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
 }
 
 pub(super) fn action_servers(graph: &Graph) -> Value {
-    json!({ "action_servers": graph.actions.keys().collect::<Vec<_>>() })
+    let served = graph.actions.iter();
+    let served = served.filter(|(_, nodes)| !nodes.servers.is_empty());
+    json!({ "action_servers": served.map(|(action, _)| action).collect::<Vec<_>>() })
+}
+
+pub(super) fn action_type(graph: &Graph, action: &str) -> Value {
+    let known = graph.actions.get(action);
+    json!({ "type": known.map_or("", |nodes| told(&nodes.type_name)) })
 }
 
 fn all_services(graph: &Graph) -> BTreeSet<String> {
@@ -184,12 +229,14 @@ pub(super) fn service_node(graph: &Graph, service: &str) -> Value {
     json!({ "node": server(graph, service) })
 }
 
-pub(super) fn service_host(graph: &Graph, service: &str) -> Value {
+/// Where ROS 2 has no addresses, all nodes are on the servant's own host.
+pub(super) fn service_host(graph: &Graph, version: RosVersion, service: &str) -> Value {
     let node = server(graph, service);
-    let address = graph
-        .nodes
-        .get(node)
-        .map_or(if node == NODE { "localhost" } else { "" }, String::as_str);
+    let address = match (version, node) {
+        (_, "") => "",
+        (RosVersion::Two, _) | (_, NODE) => "localhost",
+        (RosVersion::One, _) => graph.nodes.get(node).map_or("", String::as_str),
+    };
     let host = address.split_once("://").map_or(address, |(_, rest)| rest);
     json!({ "host": host.split([':', '/']).next().unwrap_or_default() })
 }
@@ -198,7 +245,7 @@ pub(super) fn service_host(graph: &Graph, service: &str) -> Value {
 async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
     let served = shared.bus.graph().borrow().services.contains_key(service);
     match Service::find(service) {
-        Some(own) if !served => own.type_name(),
+        Some(own) if !served => own.type_name(shared.bus.version()),
         _ => {
             let found = shared
                 .service_types
@@ -219,7 +266,6 @@ pub(super) async fn service_type(shared: &Arc<Shared>, service: &str, grants: &G
 
 /// All services of a type, sorted.
 async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<String> {
-    let wanted = plain_type(type_name);
     let asked = all_services(graph).into_iter().map(|service| {
         let shared = shared.clone();
         async move {
@@ -233,7 +279,7 @@ async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<St
         .await;
     answers
         .into_iter()
-        .filter(|(_, found)| **found == *wanted)
+        .filter(|(_, found)| is_same_type(found, type_name))
         .map(|(service, _)| service)
         .collect()
 }

@@ -1,8 +1,8 @@
-//! The parameter server. Values travel as JSON text, since a service's fields have fixed types.
+//! The parameter server of ROS 1. Values travel as JSON text, since a service's fields have fixed types.
 
 use std::sync::Arc;
 
-use ros::bus::{BusError, ParamValue};
+use ros::bus::{BusError, ParamValue, RosVersion};
 use serde_json::{Value, json};
 
 use super::Args;
@@ -13,37 +13,45 @@ fn key(args: &Args) -> Result<String, String> {
     match args.name.as_str() {
         "" => Err("field \"name\" is missing, a parameter's name is expected".to_owned()),
         "/" => Ok("/".to_owned()),
-        name => resolve(name).map(|name| name.into_owned()),
+        name => resolve(RosVersion::One, name).map(|name| name.into_owned()),
     }
 }
 
-fn failed(error: BusError) -> String {
+pub(super) fn failed(error: BusError) -> String {
     error.to_string()
+}
+
+/// What a caller wants in place of a parameter that is not there, as JSON; none where it does not say.
+pub(super) fn default(args: &Args) -> Option<String> {
+    let default = match args.default.as_str() {
+        "" => args.default_value.as_str(),
+        default => default,
+    };
+    match serde_json::from_str::<Value>(default) {
+        Ok(value) => Some(value.to_string()),
+        Err(_) if default.is_empty() => None,
+        // A default that is no JSON is a text.
+        Err(_) => Some(Value::from(default).to_string()),
+    }
+}
+
+/// A value as JSON text.
+pub(super) fn written(value: &ParamValue) -> Result<String, String> {
+    serde_json::to_string(value).map_err(|error| error.to_string())
 }
 
 pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
     let value = match shared.bus.parameter(&key(args)?).await {
-        Ok(value) => serde_json::to_string(&value).map_err(|error| error.to_string())?,
-        Err(BusError::NoParam(_)) => {
-            let default = if args.default.is_empty() {
-                &args.default_value
-            } else {
-                &args.default
-            };
-            match serde_json::from_str::<Value>(default) {
-                Ok(value) => value.to_string(),
-                Err(_) if default.is_empty() => "null".to_owned(),
-                // A default that is no JSON is a text.
-                Err(_) => Value::from(default.as_str()).to_string(),
-            }
-        }
+        Ok(value) => written(&value)?,
+        Err(BusError::NoParam(_)) => default(args).unwrap_or_else(|| "null".to_owned()),
         Err(error) => return Err(failed(error)),
     };
     Ok(json!({ "value": value }))
 }
 
-pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let value: ParamValue = serde_json::from_str(&args.value).map_err(|_| {
+/// The value that a caller gives.
+pub(super) fn given(args: &Args) -> Result<ParamValue, String> {
+    serde_json::from_str(&args.value).map_err(|_| {
         let shown: String = args.value.chars().take(48).collect();
         let given = serde_json::from_str::<Value>(&args.value);
         match given.ok().and_then(|given| null_in(&given, String::new())) {
@@ -57,7 +65,11 @@ pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
                 "field \"value\" is {shown:?}, JSON text (a boolean, number, string, list or object) is expected"
             ),
         }
-    })?;
+    })
+}
+
+pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    let value = given(args)?;
     let parameters = shared.bus.parameters().map_err(failed)?;
     parameters.set(&key(args)?, value).await.map_err(failed)?;
     Ok(json!({}))

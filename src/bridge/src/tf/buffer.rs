@@ -196,6 +196,7 @@ fn read(stamped: &Value<'_>) -> Option<(String, Link)> {
 
 #[cfg(test)]
 mod tests {
+    use ros::bus::RosVersion;
     use ros::schema::Registry;
 
     use super::*;
@@ -215,7 +216,7 @@ mod tests {
     /// The same as `tf2_msgs/TFMessage`.
     fn schema() -> Arc<MessageType> {
         let registry = Registry::new();
-        crate::tf::define(&registry);
+        crate::tf::define(RosVersion::One, &registry);
         registry.message("tf2_web_republisher/TFArray").unwrap()
     }
 

@@ -1,25 +1,21 @@
-//! Who asked for which transforms, and their sending.
+//! Who asked for which transforms, by the service and by the topics of the action.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock, Weak};
-use std::time::Duration;
 
 use access::Grants;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Message, PeerId, WireType};
+use ros::bus::{Message, PeerId, RosVersion, WireType};
 use ros::codec::{self, JsonOptions, Time};
 use ros::ros1::actions::messages::{self, GoalId, GoalState, Status};
-use ros::schema::{MessageType, Registry, ServiceDef};
-use serde::Deserialize;
+use ros::schema::{MessageType, ServiceDef};
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::buffer::Found;
-use super::transform::Transform;
-use super::{Buffer, SharedBuffer, buffer, write_transforms};
-use crate::clock;
+use super::sending::{Wanted, check, heard_on, send};
+use super::{Buffer, SharedBuffer, array_name, package};
 use crate::fanout::{Listener, Listening};
 use crate::own::OwnService;
 use crate::sample::Sample;
@@ -34,7 +30,7 @@ const FEEDBACK_TOPIC: &str = "/tf2_web_republisher/feedback";
 const RESULT_TOPIC: &str = "/tf2_web_republisher/result";
 pub(crate) const STATUS_TOPIC: &str = "/tf2_web_republisher/status";
 
-/// The action's topics: their types, and whether they are published by the action's server or to it.
+/// The action's topics in ROS 1: their types, and whether they are published by the action's server or to it.
 pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
     (
         GOAL_TOPIC,
@@ -59,42 +55,6 @@ const TOPIC_PREFIX: &str = "/tf_repub_";
 /// The action, and the node that seems to publish.
 pub(crate) const ACTION: &str = "/tf2_web_republisher";
 
-/// Requests served at once.
-const MAX_REQUESTS: usize = 1000;
-const MAX_SOURCES: usize = 1000;
-
-/// What a caller or goal asks for.
-#[derive(Debug, Clone, Deserialize)]
-#[serde(default)]
-pub(super) struct Wanted {
-    source_frames: Vec<String>,
-    target_frame: String,
-    angular_thres: f64,
-    trans_thres: f64,
-    rate: f64,
-    timeout: Timeout,
-}
-
-#[derive(Debug, Clone, Copy, Default, Deserialize)]
-#[serde(default)]
-struct Timeout {
-    secs: i32,
-    nsecs: i32,
-}
-
-impl Default for Wanted {
-    fn default() -> Self {
-        Self {
-            source_frames: Vec::new(),
-            target_frame: String::new(),
-            angular_thres: 0.0,
-            trans_thres: 0.0,
-            rate: 10.0,
-            timeout: Timeout::default(),
-        }
-    }
-}
-
 /// One bridge's republisher.
 #[derive(Default)]
 pub(crate) struct Republisher {
@@ -110,10 +70,10 @@ pub(crate) struct RepublishTfs;
 
 #[async_trait]
 impl OwnService for RepublishTfs {
-    fn definition(&self, registry: &Registry) -> Result<Arc<ServiceDef>, String> {
-        registry
-            .service("tf2_web_republisher/RepublishTFs")
-            .map_err(|error| error.to_string())
+    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String> {
+        let name = format!("{}/RepublishTFs", package(shared.bus.version()));
+        let found = shared.registry.service(&name);
+        found.map_err(|error| error.to_string())
     }
 
     async fn answer(
@@ -128,9 +88,9 @@ impl OwnService for RepublishTfs {
 
 impl Republisher {
     /// The type of a topic that was made for a caller.
-    pub(crate) fn type_name(&self, topic: &str) -> Option<&'static str> {
+    pub(crate) fn type_name(&self, version: RosVersion, topic: &str) -> Option<&'static str> {
         (topic.starts_with(TOPIC_PREFIX) && self.topics.lock().contains_key(topic))
-            .then_some("tf2_web_republisher/TFArray")
+            .then(|| array_name(version))
     }
 
     /// Answers a call of the service; request and response in JSON.
@@ -143,23 +103,23 @@ impl Republisher {
         self.topics
             .lock()
             .insert(topic.clone(), stop.clone().drop_guard());
-        let patience = Duration::new(
-            wanted.timeout.secs.max(0) as u64,
-            wanted.timeout.nsecs.clamp(0, 999_999_999) as u32,
-        );
-        let patience = patience.clamp(Duration::from_secs(1), Duration::from_secs(3600));
+        let patience = wanted.patience();
         let (name, message_type) = (
             topic.clone(),
-            shared.registry.message("tf2_web_republisher/TFArray"),
+            shared.registry.message(array_name(shared.bus.version())),
         );
         let message_type = message_type.map_err(|error| error.to_string())?;
         let mut heard = Instant::now();
         let of = message_type.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
-            if let Some(fanout) = shared.live_fanout(&name) {
+            let live = shared.live_fanouts(&name);
+            if !live.is_empty() {
                 heard = Instant::now();
-                if let Some(transforms) = transforms {
-                    fanout.deliver(message(&message_type, transforms.into()), true);
+            }
+            if let Some(transforms) = transforms {
+                let message = message(&message_type, transforms.into());
+                for fanout in live {
+                    fanout.deliver(message.clone(), true);
                 }
             }
             // Nobody has listened for as long as the caller said: it is gone.
@@ -173,7 +133,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            (topic.clone(), of),
+            (heard_on(&topic), of),
             stop,
             deliver,
         ));
@@ -215,7 +175,7 @@ impl Republisher {
         let _ = self.listening.set([goals, cancels]);
     }
 
-    fn buffer(&self, shared: &Arc<Shared>) -> Arc<Buffer> {
+    pub(super) fn buffer(&self, shared: &Arc<Shared>) -> Arc<Buffer> {
         self.buffer.get(|| Buffer::new(shared))
     }
 
@@ -241,12 +201,10 @@ impl Republisher {
             .insert(goal.id.clone(), stop.clone().drop_guard());
         let of = action.feedback.clone();
         let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
-            if let (Some(fanout), Some(transforms)) =
-                (shared.live_fanout(FEEDBACK_TOPIC), transforms)
-            {
+            if let Some(transforms) = transforms {
                 let bytes =
                     messages::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
-                fanout.deliver(message(&action.action_feedback, bytes), true);
+                shared.deliver(FEEDBACK_TOPIC, &message(&action.action_feedback, bytes));
             }
             // The goal of a client that is gone is given up.
             let alive = shared.has_outlet(GOAL_TOPIC, &publisher);
@@ -259,7 +217,7 @@ impl Republisher {
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            (FEEDBACK_TOPIC.to_owned(), of),
+            (heard_on(FEEDBACK_TOPIC), of),
             stop,
             deliver,
         ));
@@ -279,16 +237,14 @@ impl Republisher {
         };
         drop(goals);
         let action = shared.registry.action("tf2_web_republisher/TFSubscription");
-        let (Some(fanout), Ok(action)) = (shared.live_fanout(RESULT_TOPIC), action) else {
-            return;
-        };
+        let Ok(action) = action else { return };
         for id in ended {
             let goal = GoalId {
                 id,
                 ..GoalId::default()
             };
             let bytes = messages::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
-            fanout.deliver(message(&action.action_result, bytes), true);
+            shared.deliver(RESULT_TOPIC, &message(&action.action_result, bytes));
         }
     }
 }
@@ -299,21 +255,6 @@ fn state(goal: &GoalId, status: Status) -> GoalState {
         status,
         text: String::new(),
     }
-}
-
-fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
-    if wanted.source_frames.len() > MAX_SOURCES {
-        return Err(format!(
-            "source_frames has {} entries, at most {MAX_SOURCES} are allowed",
-            wanted.source_frames.len()
-        ));
-    }
-    if requests >= MAX_REQUESTS {
-        return Err(format!(
-            "{MAX_REQUESTS} requests for transforms are served already; cancel some"
-        ));
-    }
-    Ok(())
 }
 
 fn message(message_type: &MessageType, bytes: Bytes) -> Message {
@@ -353,90 +294,5 @@ impl Listener for Goals {
 
     fn failed(&self, reason: &str) {
         tracing::debug!("goals for transforms cannot be heard: {reason}");
-    }
-}
-
-/// Gives `deliver` what has changed for those who listen to `topic`, at the rate asked for, until that says no or `stop`
-/// is cancelled.
-async fn send(
-    shared: Weak<Shared>,
-    buffer: Arc<Buffer>,
-    wanted: Wanted,
-    (topic, of): (String, Arc<MessageType>),
-    stop: CancellationToken,
-    mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
-) {
-    let rate = if wanted.rate > 0.0 {
-        wanted.rate.clamp(0.01, 1000.0)
-    } else {
-        10.0
-    };
-    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / rate));
-    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    let target = buffer::plain(&wanted.target_frame);
-    let mut sent: HashMap<&str, Transform> = HashMap::new();
-    let mut heard_by = None;
-    loop {
-        tokio::select! {
-            () = stop.cancelled() => return,
-            _ = ticks.tick() => {}
-        }
-        let Some(shared) = shared.upgrade() else {
-            return;
-        };
-        // Callers learn the topic's name from the answer and listen only then; whoever comes late wants to hear all.
-        let newest = shared
-            .live_fanout(&topic)
-            .and_then(|fanout| fanout.newest_listener());
-        if newest != heard_by {
-            heard_by = newest;
-            sent.clear();
-        }
-        if heard_by.is_none() {
-            if !deliver(&shared, None) {
-                return;
-            }
-            continue;
-        }
-        let mut changed: Vec<(&str, &str, Transform, Option<Time>)> = Vec::new();
-        for source in wanted
-            .source_frames
-            .iter()
-            .map(|source| buffer::plain(source))
-        {
-            let Some(Found {
-                transform: now,
-                time,
-            }) = buffer.find(target, source)
-            else {
-                continue;
-            };
-            let moved = sent.get(source).is_none_or(|before| {
-                let (metres, radians) = now.distance(before);
-                metres > wanted.trans_thres || radians > wanted.angular_thres
-            });
-            if moved {
-                sent.insert(source, now);
-                changed.push((target, source, now, time));
-            }
-        }
-        // What never moves is there now, too.
-        let now = match changed.iter().any(|(.., time)| time.is_none()) {
-            true => clock::now(&shared).await,
-            false => Time::default(),
-        };
-        let changed: Vec<_> = changed
-            .into_iter()
-            .map(|(target, source, transform, time)| {
-                (target, source, transform, time.unwrap_or(now))
-            })
-            .collect();
-        let transforms = match changed.is_empty() {
-            true => None,
-            false => write_transforms(&of, changed).ok(),
-        };
-        if !deliver(&shared, transforms) {
-            return;
-        }
     }
 }

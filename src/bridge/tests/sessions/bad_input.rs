@@ -12,18 +12,18 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
     vec![
         (
             json!({"op": "advertise", "topic": "/a", "type": "std_msgs/String", "latch": false, "queue_size": 1,
-                "md5sum": "*"}),
+                "md5sum": "*", "qos": {"depth": 1}}),
             &["topic", "type"],
         ),
         (json!({"op": "unadvertise", "topic": "/a"}), &["topic"]),
         (
             json!({"op": "publish", "topic": "/a", "msg": {"data": "x"}, "type": "std_msgs/String", "latch": false,
-                "compression": "none"}),
+                "compression": "none", "qos": {"depth": 1}}),
             &["topic"],
         ),
         (
             json!({"op": "subscribe", "topic": "/a", "type": "std_msgs/String", "throttle_rate": 1, "queue_length": 1,
-                "fragment_size": 100, "compression": "none"}),
+                "fragment_size": 100, "compression": "none", "qos": {"depth": 1}}),
             &["topic"],
         ),
         (json!({"op": "unsubscribe", "topic": "/a"}), &["topic"]),
@@ -187,11 +187,37 @@ async fn a_field_of_another_kind_is_named() {
             let wrong = match field {
                 "values" if op != "action_feedback" => continue,
                 field if is_payload(op, field) => json!(7),
+                // Of this one, too, names that mean nothing are ignored.
+                "qos" => json!([{"depth": 1}]),
                 _ => json!({"x": [1, 2]}),
             };
             cases.push((with(message, field, wrong), field));
         }
     }
+    are_refused_by_name(cases).await;
+}
+
+#[tokio::test]
+async fn a_policy_that_cannot_be_meant_is_named() {
+    let messages = messages();
+    let mut cases = Vec::new();
+    let able = |op: &&(Value, _)| op.0.get("qos").is_some();
+    for (message, _) in messages.iter().filter(able) {
+        for (policy, value, field) in [
+            ("history", json!("keep_some"), "qos.history"),
+            ("depth", json!(-1), "qos.depth"),
+            ("reliability", json!(7), "qos.reliability"),
+            ("durability", json!(["volatile"]), "qos.durability"),
+            ("deadline", json!("soon"), "qos.deadline"),
+            ("lifespan", json!({"sec": 1}), "qos.lifespan"),
+            ("liveliness", json!(true), "qos.liveliness"),
+        ] {
+            let mut qos = json!({});
+            qos[policy] = value;
+            cases.push((with(message, "qos", qos), field));
+        }
+    }
+    assert_eq!(cases.len(), 3 * 7);
     are_refused_by_name(cases).await;
 }
 

@@ -86,7 +86,7 @@ async fn each_operation_is_refused_that_is_not_granted() {
         ),
         (
             json!({"op": "call_service", "service": "/rosapi/set_param", "id": "c",
-                   "args": {"name": "/p", "value": "1"}}),
+                   "args": {"name": "/node:p", "value": "1"}}),
             "service_response",
             "call:/rosapi/set_param",
         ),
@@ -171,7 +171,7 @@ async fn rosapi_tells_of_names_alone_that_its_caller_may_use() {
         assert_eq!(ask(service, args).await[field], "", "{service}");
     }
     let known = ask("service_type", json!({"service": "/detect"})).await;
-    assert_eq!(known["type"], "x_msgs/Nothing");
+    assert_eq!(known["type"], world.full_name("x_msgs/Nothing", "srv"));
     let publishers = ask("publishers", json!({"topic": "/secret"})).await;
     assert_eq!(publishers["publishers"], json!([]));
 }

@@ -1,7 +1,8 @@
 //! What clients and nodes see of a bridge, with clients that speak WebSocket by another implementation than the bridge's:
-//! over ROS 1 (a real Master, a real node on its own bus, real TCPROS on loopback), and over a bus of another kind.
+//! over ROS 1 (a real Master, a real node on its own bus, real TCPROS on loopback), and over a bus in memory that behaves as
+//! ROS 2 does, with its messages.
 
-// The same tests, over two buses.
+// The same tests, for two ROSes.
 #![allow(clippy::duplicate_mod)]
 
 #[path = "../../../../tests/support/memory_bus.rs"]

@@ -261,7 +261,7 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
     let bytes = |length: usize| {
         let mut message = (length as u32).to_le_bytes().to_vec();
         message.resize(4 + length, 7);
-        bytes::Bytes::from(message)
+        world.serialized(&message)
     };
     publisher.publish(bytes(1 << 20));
     let heard = client.json().await;

@@ -63,10 +63,10 @@ async fn until(condition: impl Fn() -> bool) {
     .await;
 }
 
-fn bytes(length: usize) -> Bytes {
+fn bytes(world: &World, length: usize) -> Bytes {
     let mut message = (length as u32).to_le_bytes().to_vec();
     message.resize(4 + length, 7);
-    message.into()
+    world.serialized(&message)
 }
 
 fn length(message: &Value) -> usize {
@@ -93,7 +93,7 @@ async fn a_message_counts_for_its_client_until_it_is_read() {
         let mut client = budgets.client(&world).await;
         subscribed(&mut client, fragment_size).await;
         connected(publisher.as_ref(), 1).await;
-        publisher.publish(bytes(2 * MIB));
+        publisher.publish(bytes(&world, 2 * MIB));
         until(|| budgets.client.used() > 2 * MIB).await;
         // What the servant's budget counted while it was encoded is not what it lacks for others.
         until(|| budgets.servant.used() == 0).await;
@@ -129,7 +129,7 @@ async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() 
         subscribed(client, None).await;
     }
     connected(publisher.as_ref(), 1).await;
-    publisher.publish(bytes(2 * MIB));
+    publisher.publish(bytes(&world, 2 * MIB));
     assert!(length(&quick.json().await) > 2 * MIB);
     // Base64 makes 2.7 MiB of it: there is room for two. The others' were dropped from their queue, or left out.
     until(|| budgets.client.refused() >= 4).await;
@@ -174,7 +174,7 @@ async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budge
     // Some count for the daemon by themselves, some do not.
     let mut newest = 0;
     for size in (0..200).map(|number| 10_000 + number + number % 2 * 100_000) {
-        publisher.publish(bytes(size));
+        publisher.publish(bytes(&world, size));
         newest = quick.binary().await.len();
         assert!(newest > size);
     }
@@ -205,8 +205,9 @@ async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
         let world = budgets.world().await;
         let mut client = budgets.client(&world).await;
         let words = json!({"words": "x".repeat(size)});
-        let words = world.message("x_msgs/SayResponse", words);
-        let of = ServiceType::of(&world.registry.service("x_msgs/Say").unwrap());
+        let say = world.registry.service("x_msgs/Say").unwrap();
+        let words = world.message(say.response.name(), words);
+        let of = ServiceType::of(&say);
         let served = world.node.serve("/long", of, Arc::new(Says(words)));
         let _served = served.await.unwrap();
         world

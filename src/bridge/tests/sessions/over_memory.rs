@@ -1,4 +1,4 @@
-//! Sessions over a bus whose actions are its own, and that has no global parameters.
+//! Sessions over a bus of ROS 2, in memory.
 
 #[path = "actions.rs"]
 mod actions;
@@ -10,8 +10,12 @@ mod granted;
 mod manners;
 #[path = "memory.rs"]
 mod memory;
+#[path = "node_parameters.rs"]
+mod node_parameters;
 #[path = "publishing.rs"]
 mod publishing;
+#[path = "qualities.rs"]
+mod qualities;
 #[path = "requests.rs"]
 mod requests;
 #[path = "resuming.rs"]
@@ -26,8 +30,8 @@ mod subscribing;
 mod transforms;
 #[path = "waiting.rs"]
 mod waiting;
-#[path = "without_parameters.rs"]
-mod without_parameters;
+#[path = "without_definitions.rs"]
+mod without_definitions;
 
 mod support {
     pub use crate::support::*;

@@ -6,6 +6,8 @@ mod actions;
 mod actions_by_topics;
 #[path = "bad_input.rs"]
 mod bad_input;
+#[path = "definitions.rs"]
+mod definitions;
 #[path = "granted.rs"]
 mod granted;
 #[path = "manners.rs"]
@@ -28,6 +30,8 @@ mod services;
 mod subscribing;
 #[path = "transforms.rs"]
 mod transforms;
+#[path = "transforms_by_topics.rs"]
+mod transforms_by_topics;
 #[path = "waiting.rs"]
 mod waiting;
 

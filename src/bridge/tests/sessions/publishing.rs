@@ -1,7 +1,7 @@
 //! Topics from clients to nodes.
 
 use rosbridge::{Compression, Format, Op, Publish};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::support::{World, patiently};
 
@@ -48,7 +48,7 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
         (&value["x"], &value["near"], &value["tags"]),
         (&json!(2.0), &json!([]), &json!([]))
     );
-    assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
+    assert!(world.seconds(&value["header"]["stamp"]) > 1_500_000_000);
     // Who wants to know is told.
     client
         .send(json!({"op": "set_level", "level": "warning"}))
@@ -77,7 +77,10 @@ async fn without_advertise_the_type_is_the_topics() {
         .send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}}))
         .await;
     let message = patiently(heard.messages.recv()).await.unwrap();
-    assert_eq!(&*message.bytes, b"\x01\0\0\0x");
+    assert_eq!(
+        message.bytes,
+        world.message("std_msgs/String", json!({"data": "x"}))
+    );
     client
         .send(json!({"op": "publish", "topic": "/nothing", "msg": {}}))
         .await;
@@ -117,6 +120,7 @@ async fn ros_bytes_pass_through_untouched_and_are_checked() {
             compression: Compression::CborRaw,
             latch: false,
             type_name: None,
+            qos: None,
         });
         let mut out = Vec::new();
         op.print(&mut out, Format::Cbor);
@@ -133,33 +137,41 @@ async fn ros_bytes_pass_through_untouched_and_are_checked() {
         panic!("{status:?}")
     };
     assert_eq!(status.id, Some("p1".into()));
-    assert!(
-        status
-            .msg
-            .starts_with("publish: topic /bytes: field data of std_msgs/UInt8MultiArray: "),
-        "{}",
-        status.msg
+    let expected = format!(
+        "publish: topic /bytes: field data of {}: ",
+        world.spelled("std_msgs/UInt8MultiArray")
     );
+    assert!(status.msg.starts_with(&expected), "{}", status.msg);
     client
         .send(
             json!({"op": "advertise", "topic": "/other", "type": "std_msgs/String", "md5sum": md5}),
         )
         .await;
-    assert!(
-        client
-            .refusal()
-            .await
-            .contains("has MD5 992ce8a1687cec8c8bd883ec73ca41d1 here and ")
-    );
+    let ours = world.wire_type("std_msgs/String").digest;
+    let expected = format!("has {} {ours} here and {md5} there", world.digest_word());
+    assert!(client.refusal().await.contains(&expected));
 }
 
 #[tokio::test]
 async fn a_client_latches_for_nodes_and_clients_that_come_later() {
+    for words in [
+        json!({"latch": true}),
+        json!({"qos": {"durability": "transient_local"}}),
+        json!({"qos": {"durability": 1, "depth": 1, "reliability": 1, "history": 1}}),
+    ] {
+        latches(words).await;
+    }
+}
+
+/// A client that advertises in these words latches.
+async fn latches(words: Value) {
     let world = World::new().await;
     let mut client = world.client().await;
-    client
-        .send(json!({"op": "advertise", "topic": "/map", "type": "std_msgs/Int32", "latch": true}))
-        .await;
+    let mut advertise = json!({"op": "advertise", "topic": "/map", "type": "std_msgs/Int32"});
+    for (key, value) in words.as_object().unwrap() {
+        advertise[key] = value.clone();
+    }
+    client.send(advertise).await;
     client
         .send(json!({"op": "publish", "topic": "/map", "msg": {"data": 42}}))
         .await;
@@ -169,8 +181,8 @@ async fn a_client_latches_for_nodes_and_clients_that_come_later() {
     assert_eq!(late.json().await["msg"], json!({"data": 42}));
     let mut heard = world.node_subscribes("/map", "std_msgs/Int32").await;
     assert_eq!(
-        &*patiently(heard.messages.recv()).await.unwrap().bytes,
-        [42, 0, 0, 0]
+        patiently(heard.messages.recv()).await.unwrap().bytes,
+        world.serialized(&[42, 0, 0, 0])
     );
     client
         .send(json!({"op": "unadvertise", "topic": "/map"}))
@@ -205,7 +217,8 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
             .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": msg}))
             .await;
         let text = client.refusal().await;
-        let expected = format!("publish: topic /place: field {field} of x_msgs/Place: ");
+        let of = world.spelled("x_msgs/Place");
+        let expected = format!("publish: topic /place: field {field} of {of}: ");
         assert!(text.starts_with(&expected), "{text}");
     }
     client
@@ -213,14 +226,21 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "advertise: topic /lost: no definition of x_msgs/Lost is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too"
+        format!(
+            "advertise: topic /lost: no definition of {} is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too",
+            world.spelled("x_msgs/Lost")
+        )
     );
     client
         .send(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/Int32"}))
         .await;
     assert_eq!(
         client.refusal().await,
-        "advertise: topic /text has type std_msgs/String, not std_msgs/Int32"
+        format!(
+            "advertise: topic /text has type {}, not {}",
+            world.spelled("std_msgs/String"),
+            world.spelled("std_msgs/Int32")
+        )
     );
     client
         .send_text(r#"{"op":"publish","topic":"/place","msg":{"x":1}"#)
@@ -255,12 +275,12 @@ async fn a_message_that_is_left_out_is_one_of_defaults() {
     let message = patiently(heard.messages.recv()).await.unwrap();
     let value = world.json("x_msgs/Place", &message.bytes);
     assert_eq!((&value["x"], &value["tags"]), (&json!(0.0), &json!([])));
-    assert!(value["header"]["stamp"]["secs"].as_u64().unwrap() > 1_500_000_000);
+    assert!(world.seconds(&value["header"]["stamp"]) > 1_500_000_000);
     client.settled().await;
 }
 
 #[tokio::test]
-async fn stamps_may_be_written_as_in_ros_2() {
+async fn stamps_may_be_written_as_in_either_ros() {
     let world = World::new().await;
     let mut heard = world.node_subscribes("/place", "x_msgs/Place").await;
     let mut client = world.client().await;
@@ -278,7 +298,7 @@ async fn stamps_may_be_written_as_in_ros_2() {
             .await;
         let message = patiently(heard.messages.recv()).await.unwrap();
         let value = world.json("x_msgs/Place", &message.bytes);
-        assert_eq!(value["header"]["stamp"], json!({"secs": 5, "nsecs": 6}));
+        assert_eq!(value["header"]["stamp"], world.time(5, 6));
     }
     client.settled().await;
 }
@@ -345,10 +365,17 @@ async fn why_nothing_can_be_published_is_said_once() {
     client
         .send(json!({"op": "advertise", "topic": "/plan", "type": "nav_msgs/Path"}))
         .await;
+    let hint = world.either(
+        "--with ros-nav-msgs",
+        "of a workspace that has nav_msgs, too",
+    );
     assert_eq!(
         client.refusal().await,
-        "advertise: topic /plan: no definition of nav_msgs/Path is known here; \
-         whoever deploys this service can add it: cloudroidctl push … --with ros-nav-msgs"
+        format!(
+            "advertise: topic /plan: no definition of {} is known here; \
+             whoever deploys this service can add it: cloudroidctl push … {hint}",
+            world.spelled("nav_msgs/Path")
+        )
     );
     let typed = json!({"op": "publish", "topic": "/route", "type": "nav_msgs/Path", "msg": {}});
     let untyped = json!({"op": "publish", "topic": "/plan", "msg": {}});
@@ -357,7 +384,7 @@ async fn why_nothing_can_be_published_is_said_once() {
         client.send(typed.clone()).await;
     }
     // The one of the topic that was advertised has been said; of the other it is said now.
-    assert!(client.refusal().await.contains("--with ros-nav-msgs"));
+    assert!(client.refusal().await.contains(hint));
     client.settled().await;
     // Who asks again is told again.
     client

@@ -31,13 +31,15 @@ async fn next(told: &mut Told) -> Option<Duration> {
     patiently(told.recv()).await.unwrap()
 }
 
-struct Refuses;
+/// Gives the second number back, and refuses calls whose first is not 0; so many bytes stand in front of both.
+struct Refuses(usize);
 
 #[async_trait::async_trait]
 impl ServiceHandler for Refuses {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        match request[0] {
-            0 => Ok(Bytes::copy_from_slice(&request[8..])),
+        let (header, numbers) = request.split_at(self.0);
+        match numbers[0] {
+            0 => Ok([header, &numbers[8..]].concat().into()),
             _ => Err("not today".to_owned()),
         }
     }
@@ -50,7 +52,11 @@ async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() 
     let def = world.registry.service("x_msgs/Add").unwrap();
     let _served = world
         .node
-        .serve("/add", ServiceType::of(&def), Arc::new(Refuses))
+        .serve(
+            "/add",
+            ServiceType::of(&def),
+            Arc::new(Refuses(world.either(0, 4))),
+        )
         .await
         .unwrap();
     let there = |graph: &ros::bus::Graph| graph.services.contains_key("/add");

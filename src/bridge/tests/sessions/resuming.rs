@@ -7,6 +7,7 @@ use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
+use ros::codec;
 use serde_json::json;
 use tokio::sync::Notify;
 
@@ -19,13 +20,14 @@ fn with_token(token: &str) -> SessionOptions {
     }
 }
 
-struct Gated(Arc<Notify>);
+/// Gives this answer when it is let go.
+struct Gated(Arc<Notify>, Bytes);
 
 #[async_trait]
 impl ServiceHandler for Gated {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
         self.0.notified().await;
-        Ok(Bytes::new())
+        Ok(self.1.clone())
     }
 }
 
@@ -39,9 +41,14 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     let def = world.registry.service("x_msgs/Nothing").unwrap();
     let gate = Arc::new(Notify::new());
     let service_type = ServiceType::of(&def);
+    let answer = codec::default_message(&def.response).into();
     let _served = world
         .node
-        .serve("/gated", service_type, Arc::new(Gated(gate.clone())))
+        .serve(
+            "/gated",
+            service_type,
+            Arc::new(Gated(gate.clone(), answer)),
+        )
         .await
         .unwrap();
     world
@@ -86,8 +93,8 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
         .send(json!({"op": "publish", "topic": "/number", "msg": {"data": 2}}))
         .await;
     assert_eq!(
-        &*patiently(heard.messages.recv()).await.unwrap().bytes,
-        [2, 0, 0, 0]
+        patiently(heard.messages.recv()).await.unwrap().bytes,
+        world.serialized(&[2, 0, 0, 0])
     );
     client.settled().await;
     assert_eq!(publisher.matched().borrow().connected(), 1);

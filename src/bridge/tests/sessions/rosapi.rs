@@ -1,5 +1,6 @@
 //! What the bridge answers about the ROS system.
 
+use ros::bus::RosVersion;
 use rosbridge::{CallService, Compression, Format, Frame, Op};
 use serde_json::{Value, json};
 
@@ -53,41 +54,39 @@ async fn topics_nodes_and_services_are_found() {
 
     let topics = ask(&mut client, "topics", json!({})).await;
     // The bridge's own among them, as where nodes of rosbridge publish them.
-    assert_eq!(
-        topics["topics"],
-        json!([
-            "/client_count",
-            "/connected_clients",
-            "/number",
-            "/rosout",
-            "/text",
-            "/tf2_web_republisher/cancel",
-            "/tf2_web_republisher/feedback",
-            "/tf2_web_republisher/goal",
-            "/tf2_web_republisher/result",
-            "/tf2_web_republisher/status",
-        ])
-    );
-    assert_eq!(topics["types"][2], "std_msgs/Int32");
-    assert_eq!(topics["types"][9], "actionlib_msgs/GoalStatusArray");
+    let shown = [
+        "/client_count",
+        "/connected_clients",
+        "/number",
+        "/rosout",
+        "/text",
+        "/tf2_web_republisher/cancel",
+        "/tf2_web_republisher/feedback",
+        "/tf2_web_republisher/goal",
+        "/tf2_web_republisher/result",
+        "/tf2_web_republisher/status",
+    ];
+    // In ROS 2 actions are no topics.
+    assert_eq!(topics["topics"], json!(shown[..world.either(10, 5)]));
+    assert_eq!(topics["types"][2], world.spelled("std_msgs/Int32"));
+    if world.version() == RosVersion::One {
+        assert_eq!(topics["types"][9], "actionlib_msgs/GoalStatusArray");
+    }
     let raw = ask(&mut client, "topics_and_raw_types", json!({})).await;
     assert_eq!(raw["typedefs_full_text"][2], "int32 data\n");
     assert_eq!(raw["typedefs_full_text"][4], "string data\n");
     assert_eq!(
         ask(&mut client, "topic_type", json!({"topic": "/text"})).await,
-        json!({"type": "std_msgs/String"})
+        json!({"type": world.spelled("std_msgs/String")})
     );
     assert_eq!(
         ask(&mut client, "topic_type", json!({"topic": "/none"})).await,
         json!({"type": ""})
     );
-    let of_type = ask(
-        &mut client,
-        "topics_for_type",
-        json!({"type": "std_msgs/String"}),
-    )
-    .await;
-    assert_eq!(of_type, json!({"topics": ["/text"]}));
+    for name in ["std_msgs/String", "std_msgs/msg/String"] {
+        let of_type = ask(&mut client, "topics_for_type", json!({"type": name})).await;
+        assert_eq!(of_type, json!({"topics": ["/text"]}));
+    }
     assert_eq!(
         ask(&mut client, "publishers", json!({"topic": "/text"})).await,
         json!({"publishers": ["/node"]})
@@ -109,11 +108,11 @@ async fn topics_nodes_and_services_are_found() {
     assert!(holds(&services["services"], "/add") && holds(&services["services"], "/rosapi/topics"));
     assert_eq!(
         ask(&mut client, "service_type", json!({"service": "/add"})).await,
-        json!({"type": "x_msgs/Add"})
+        json!({"type": world.full_name("x_msgs/Add", "srv")})
     );
     assert_eq!(
         ask(&mut client, "service_type", json!(["/rosapi/topics"])).await,
-        json!({"type": "rosapi/Topics"})
+        json!({"type": world.either("rosapi/Topics", "rosapi_msgs/srv/Topics")})
     );
     assert_eq!(
         ask(&mut client, "service_type", json!({"service": "/no"})).await,
@@ -125,13 +124,10 @@ async fn topics_nodes_and_services_are_found() {
         ask(&mut client, "service_host", json!({"service": "/add"})).await,
         json!({"host": world.host()})
     );
-    let of_type = ask(
-        &mut client,
-        "services_for_type",
-        json!({"type": "x_msgs/Add"}),
-    )
-    .await;
-    assert_eq!(of_type, json!({"services": ["/add"]}));
+    for name in ["x_msgs/Add", "x_msgs/srv/Add"] {
+        let of_type = ask(&mut client, "services_for_type", json!({"type": name})).await;
+        assert_eq!(of_type, json!({"services": ["/add"]}));
+    }
     let providers = ask(
         &mut client,
         "service_providers",
@@ -170,7 +166,46 @@ async fn topics_nodes_and_services_are_found() {
         json!({"version": world.node.version().number(), "distro": world.node.distribution().await})
     );
     let time = ask(&mut client, "get_time", json!({})).await;
+    assert!(world.seconds(&time["time"]) > 1_500_000_000);
+    // By roslibpy's name for them in either ROS.
     assert!(time["time"]["secs"].as_u64().unwrap() > 1_500_000_000);
+}
+
+#[tokio::test]
+async fn actions_and_interfaces_are_found() {
+    let world = World::new().await;
+    let (mut server, mut client) = (world.client().await, world.client().await);
+    super::actions::serve(&mut server).await;
+    // The bridge sees a change of the graph when the node does, or a moment later.
+    let of_action = json!({"action": "/count"});
+    let mut told = ask(&mut client, "action_type", of_action.clone()).await;
+    while told["type"] == "" {
+        told = ask(&mut client, "action_type", of_action.clone()).await;
+    }
+    assert_eq!(told["type"], world.full_name("x_msgs/Count", "action"));
+    let unknown = ask(&mut client, "action_type", json!({"action": "/no"})).await;
+    assert_eq!(unknown, json!({"type": ""}));
+    let servers = ask(&mut client, "action_servers", json!({})).await;
+    assert_eq!(
+        servers,
+        json!({"action_servers": ["/count", "/tf2_web_republisher"]})
+    );
+    for (part, field) in [("goal", "to"), ("result", "all"), ("feedback", "at")] {
+        for name in ["x_msgs/Count", "x_msgs/action/Count"] {
+            let service = format!("action_{part}_details");
+            let told = ask(&mut client, &service, json!({"type": name})).await;
+            assert_eq!(told["typedefs"][0]["fieldnames"], json!([field]));
+        }
+    }
+    let interfaces = ask(&mut client, "interfaces", json!({})).await;
+    for name in [
+        "std_msgs/msg/String",
+        "x_msgs/srv/Add",
+        "x_msgs/action/Count",
+        world.either("rosapi/srv/Topics", "rosapi_msgs/srv/Topics"),
+    ] {
+        assert!(holds(&interfaces["interfaces"], name), "{name}");
+    }
 }
 
 #[tokio::test]
@@ -203,20 +238,22 @@ async fn who_is_connected_can_be_followed() {
 async fn questions_that_make_no_sense_are_answered_with_the_reason() {
     let world = World::new().await;
     let mut client = world.client().await;
+    let parameter = world.either("/p", "/node:p");
+    let unknown = format!("no definition of {} is known", world.spelled("x_msgs/Lost"));
     for (service, args, reason) in [
         (
             "set_param",
-            json!({"name": "/p", "value": "{"}),
+            json!({"name": parameter, "value": "{"}),
             "field \"value\" is \"{\", JSON text",
         ),
         (
             "set_param",
-            json!({"name": "/p", "value": "null"}),
+            json!({"name": parameter, "value": "null"}),
             "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one",
         ),
         (
             "set_param",
-            json!({"name": "/p", "value": r#"{"arms": [1, null]}"#}),
+            json!({"name": parameter, "value": r#"{"arms": [1, null]}"#}),
             "field \"value\" holds null at /arms/1, which no ROS parameter can; leave it out",
         ),
         ("get_param", json!({}), "field \"name\" is missing"),
@@ -228,7 +265,7 @@ async fn questions_that_make_no_sense_are_answered_with_the_reason() {
         (
             "message_details",
             json!({"type": "x_msgs/Lost"}),
-            "no definition of x_msgs/Lost is known",
+            unknown.as_str(),
         ),
         (
             "no_such",
@@ -276,7 +313,10 @@ async fn rosapi_speaks_cbor_and_ros_bytes_too() {
         let (version, distro) = (&version[..], distro.as_bytes());
         match compression {
             Compression::CborRaw => {
-                let expected = [version, b"\x06\0\0\0", distro].concat();
+                // In ROS 2 lengths are aligned, and count the zero that ends a text.
+                let length = world.either(&b"\x06\0\0\0"[..], &b"\0\0\0\x07\0\0\0"[..]);
+                let end = world.either(&b""[..], &b"\0"[..]);
+                let expected = world.serialized(&[version, length, distro, end].concat());
                 assert_eq!(&*values.raw().unwrap().bytes, expected);
             }
             _ => {
@@ -294,15 +334,8 @@ async fn rosapi_tells_its_log_as_every_node_does() {
     let rosout = json!({"topic": "/rosout"});
     let publishers = ask(&mut client, "publishers", rosout.clone()).await;
     assert_eq!(publishers["publishers"], json!(["/rosapi"]));
-    assert_eq!(
-        ask(&mut client, "topic_type", rosout).await["type"],
-        "rosgraph_msgs/Log"
-    );
-    let found = ask(
-        &mut client,
-        "topics_for_type",
-        json!({"type": "rosgraph_msgs/Log"}),
-    )
-    .await;
+    let log = world.either("rosgraph_msgs/Log", "rcl_interfaces/msg/Log");
+    assert_eq!(ask(&mut client, "topic_type", rosout).await["type"], log);
+    let found = ask(&mut client, "topics_for_type", json!({"type": log})).await;
     assert_eq!(found["topics"], json!(["/rosout"]));
 }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use bridge::{BridgeOptions, SessionOptions};
+use ros::bus::RosVersion;
 use ros::codec::{self, FillOptions};
 use rosbridge::{Frame, Op};
 use serde_json::json;
@@ -13,10 +14,13 @@ use super::support::{World, connected, patient};
 async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
     let world = World::new().await;
     let publisher = world.node_publishes("/place", "x_msgs/Place", false).await;
-    let value = json!({
-        "header": {"seq": 1, "stamp": {"secs": 2, "nsecs": 3}, "frame_id": "map"},
+    let mut value = json!({
+        "header": {"stamp": world.time(2, 3), "frame_id": "map"},
         "x": 1.5, "near": [1.0, 2.5], "tags": [{"name": "döör", "number": 7}],
     });
+    if world.version() == RosVersion::One {
+        value["header"]["seq"] = 1.into();
+    }
     let bytes = world.message("x_msgs/Place", value.clone());
     for compression in ["none", "png", "cbor", "cbor-raw"] {
         let mut client = world.client().await;
@@ -213,14 +217,21 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "subscribe: topic /nothing: no definition of x_msgs/Lost is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too"
+        format!(
+            "subscribe: topic /nothing: no definition of {} is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too",
+            world.spelled("x_msgs/Lost")
+        )
     );
     client
         .send(json!({"op": "subscribe", "topic": "/text", "type": "std_msgs/Int32"}))
         .await;
     assert_eq!(
         client.refusal().await,
-        "subscribe: topic /text has type std_msgs/String, not std_msgs/Int32"
+        format!(
+            "subscribe: topic /text has type {}, not {}",
+            world.spelled("std_msgs/String"),
+            world.spelled("std_msgs/Int32")
+        )
     );
     client
         .send(json!({"op": "subscribe", "topic": "/no spaces"}))
@@ -247,13 +258,12 @@ async fn a_node_that_sends_rubbish_is_named_and_harms_nobody() {
     client.settled().await;
     connected(publisher.as_ref(), 1).await;
     for _ in 0..100 {
-        publisher.publish(vec![0xff, 0xff, 0xff, 0xff, b'x'].into());
+        publisher.publish(world.serialized(&[0xff, 0xff, 0xff, 0xff, b'x']));
     }
     let text = client.refusal().await;
-    assert!(
-        text.starts_with("subscribe: topic /text: field data of std_msgs/String: "),
-        "{text}"
-    );
+    let of = world.spelled("std_msgs/String");
+    let expected = format!("subscribe: topic /text: field data of {of}: ");
+    assert!(text.starts_with(&expected), "{text}");
     assert!(text.ends_with("(from /node)"), "{text}");
     publisher.publish(world.message("std_msgs/String", json!({"data": "well"})));
     assert_eq!(client.json().await["msg"]["data"], "well");
@@ -271,15 +281,24 @@ async fn a_later_publisher_of_another_type_is_named_and_left_out() {
     let wrong = world
         .publishes(&*other, "/late", "std_msgs/Int32", false)
         .await;
-    connected(wrong.as_ref(), 1).await;
+    // In ROS 2 ends of other types do not even meet.
+    if world.version() == RosVersion::One {
+        connected(wrong.as_ref(), 1).await;
+    }
     for _ in 0..100 {
         wrong.publish(world.message("std_msgs/Int32", json!({"data": 7})));
     }
     let status = client.json().await;
+    let theirs = world.wire_type("std_msgs/Int32");
+    let expected = world.either(
+        "subscribe: topic /late: /other publishes std_msgs/Int32 there, not std_msgs/String; its messages are left out".to_owned(),
+        format!(
+            "subscribe: topic /late: nothing passes between /other and this client: its type is {theirs} there and std_msgs/msg/String * here"
+        ),
+    );
     assert_eq!(
         status,
-        json!({"op": "status", "id": "s", "level": "error", "msg":
-            "subscribe: topic /late: /other publishes std_msgs/Int32 there, not std_msgs/String; its messages are left out"})
+        json!({"op": "status", "id": "s", "level": "error", "msg": expected})
     );
     // The right one is heard, and the wrong one not complained about again and again.
     let right = world
@@ -294,82 +313,6 @@ async fn a_later_publisher_of_another_type_is_named_and_left_out() {
         .await;
     assert!(client.refusal().await.contains("/late"));
     client.settled().await;
-}
-
-#[tokio::test]
-async fn a_publisher_with_another_definition_is_read_by_its_own() {
-    let world = World::new().await;
-    // The same name as one of ours, from a newer version of its package.
-    let definition = "string name\nuint8 number\nbool new\n".to_owned();
-    let newer = ros::schema::MessageType::from_full_text("x_msgs/Tag", &definition).unwrap();
-    let wire_type =
-        |definition: String| ros::bus::WireType::new("x_msgs/Tag", newer.md5(), definition);
-    let bytes = bytes::Bytes::from_static(b"\x01\0\0\0x\x07\x01");
-    let told = ros::bus::Bus::advertise(
-        &*world.node,
-        "/told",
-        wire_type(definition),
-        ros::bus::Qos::keep_last(1).latching(true),
-    )
-    .await
-    .unwrap();
-    told.publish(bytes.clone());
-    let mute = ros::bus::Bus::advertise(
-        &*world.node,
-        "/mute",
-        wire_type(String::new()),
-        ros::bus::Qos::keep_last(1).latching(true),
-    )
-    .await
-    .unwrap();
-    mute.publish(bytes);
-    world
-        .in_graph(|graph| graph.topics.contains_key("/told") && graph.topics.contains_key("/mute"))
-        .await;
-    let mut client = world.client().await;
-    for topic in ["/told", "/mute"] {
-        client
-            .send(json!({"op": "subscribe", "topic": topic, "type": "x_msgs/Tag"}))
-            .await;
-        let heard = client.json().await;
-        if topic == "/told" {
-            let value = json!({"name": "x", "number": 7, "new": true});
-            assert_eq!(heard["msg"], value, "{heard}");
-        } else {
-            let expected = format!(
-                "subscribe: topic /mute: its type x_msgs/Tag has MD5 {}, ours has ",
-                newer.md5()
-            );
-            let text = heard["msg"].as_str().unwrap();
-            assert!(text.starts_with(&expected), "{heard}");
-        }
-    }
-    client.settled().await;
-}
-
-#[tokio::test]
-async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
-    let world = World::new().await;
-    let definition = "int32 a\nstring b\n".to_owned();
-    let message_type = ros::schema::MessageType::from_full_text("y_msgs/New", &definition).unwrap();
-    let wire_type = ros::bus::WireType::new("y_msgs/New", message_type.md5(), definition);
-    let publisher = ros::bus::Bus::advertise(
-        &*world.node,
-        "/new",
-        wire_type,
-        ros::bus::Qos::keep_last(1).latching(true),
-    )
-    .await
-    .unwrap();
-    publisher.publish(vec![1, 0, 0, 0, 1, 0, 0, 0, b'x'].into());
-    world
-        .in_graph(|graph| graph.topics.contains_key("/new"))
-        .await;
-    let mut client = world.client().await;
-    client
-        .send(json!({"op": "subscribe", "topic": "/new"}))
-        .await;
-    assert_eq!(client.json().await["msg"], json!({"a": 1, "b": "x"}));
 }
 
 #[tokio::test]

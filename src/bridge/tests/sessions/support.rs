@@ -8,7 +8,7 @@ use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
 use ros::JoinOptions;
-use ros::bus::{Bus, Publisher, Qos, RosVersion, Subscription, WireType};
+use ros::bus::{Bus, Publisher, Qos, RosVersion, ServiceType, Subscription, WireType};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
 use ros::ros1::master::{Master, MasterOptions};
@@ -58,6 +58,8 @@ pub fn patient() -> BridgeOptions {
 /// A ROS system that nodes join.
 #[async_trait]
 pub trait System: Sized + Send + Sync + 'static {
+    /// Which ROS its nodes speak.
+    const VERSION: RosVersion;
     /// The host that its nodes seem to run on.
     const HOST: &str;
     /// A new one.
@@ -74,6 +76,7 @@ pub struct Ros1 {
 
 #[async_trait]
 impl System for Ros1 {
+    const VERSION: RosVersion = RosVersion::One;
     const HOST: &str = "127.0.0.1";
 
     async fn start() -> Self {
@@ -103,7 +106,8 @@ impl Drop for Ros1 {
 
 #[async_trait]
 impl System for Arc<MemorySystem> {
-    const HOST: &str = "memory";
+    const VERSION: RosVersion = RosVersion::Two;
+    const HOST: &str = "localhost";
 
     async fn start() -> Self {
         Arc::default()
@@ -120,7 +124,7 @@ pub struct World<S> {
     /// The servant's node.
     pub node: Arc<dyn Bus>,
     pub registry: Arc<Registry>,
-    system: S,
+    pub system: S,
 }
 
 impl<S: System> World<S> {
@@ -130,7 +134,7 @@ impl<S: System> World<S> {
 
     pub async fn with(options: BridgeOptions) -> Self {
         let system = S::start().await;
-        let registry = Registry::new();
+        let registry = Registry::of(S::VERSION);
         for (key, text) in DEFINITIONS {
             registry.insert(key, text).unwrap();
         }
@@ -149,6 +153,73 @@ impl<S: System> World<S> {
     /// The host that nodes seem to run on.
     pub fn host(&self) -> &'static str {
         S::HOST
+    }
+
+    /// Which ROS it is.
+    pub fn version(&self) -> RosVersion {
+        S::VERSION
+    }
+
+    /// The first in ROS 1, the second in ROS 2.
+    pub fn either<T>(&self, one: T, two: T) -> T {
+        match S::VERSION {
+            RosVersion::One => one,
+            RosVersion::Two => two,
+        }
+    }
+
+    /// The name of a message's type, `package/Type`, as its ROS writes it.
+    pub fn spelled(&self, name: &str) -> String {
+        self.full_name(name, "msg")
+    }
+
+    /// The same for a service's type (`srv`) or an action's (`action`).
+    pub fn full_name(&self, name: &str, kind: &str) -> String {
+        self.either(name.to_owned(), name.replacen('/', &format!("/{kind}/"), 1))
+    }
+
+    /// The name of a request's type, of a service `package/Type`.
+    pub fn request_name(&self, service: &str) -> String {
+        self.registry
+            .service(service)
+            .unwrap()
+            .request
+            .name()
+            .to_owned()
+    }
+
+    /// The type of a service, `package/Type`.
+    pub fn service_type(&self, service: &str) -> ServiceType {
+        ServiceType::of(&self.registry.service(service).unwrap())
+    }
+
+    /// What tells definitions apart.
+    pub fn digest_word(&self) -> &'static str {
+        self.either("MD5", "type hash")
+    }
+
+    /// A stamp in JSON.
+    pub fn time(&self, secs: u32, nsecs: u32) -> Value {
+        self.either(
+            serde_json::json!({"secs": secs, "nsecs": nsecs}),
+            serde_json::json!({"sec": secs, "nanosec": nsecs}),
+        )
+    }
+
+    /// The seconds of a stamp in JSON.
+    pub fn seconds(&self, stamp: &Value) -> u64 {
+        stamp[self.either("secs", "sec")].as_u64().unwrap()
+    }
+
+    /// Values one after the other, little endian and aligned, as a serialized message.
+    pub fn serialized(&self, values: &[u8]) -> Bytes {
+        let header = self.either(&b""[..], &b"\0\x01\0\0"[..]);
+        [header, values].concat().into()
+    }
+
+    /// The values of a serialized message.
+    pub fn values<'b>(&self, bytes: &'b [u8]) -> &'b [u8] {
+        &bytes[self.either(0, 4)..]
     }
 
     /// Another node.

@@ -7,9 +7,8 @@ use ros::bus::Outcome;
 use rosbridge::{ActionFeedback, ActionResult, AdvertiseAction, GoalStatus, UnadvertiseAction};
 
 use super::server::ActionServer;
-use crate::client::publishing::{decode, decode_args};
+use crate::client::decoding::{decode, decode_args};
 use crate::client::{Client, Reply};
-use crate::names::resolve;
 
 impl Client {
     pub(in crate::client) fn advertise_action(
@@ -17,7 +16,7 @@ impl Client {
         op: &AdvertiseAction<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let name = resolve(&op.action)?.into_owned();
+        let name = self.resolve(&op.action)?.into_owned();
         self.granted().check(Operation::Advertise, &name)?;
         let def = self.action_def(&name, &op.type_name)?;
         let limit = self.shared.options.max_advertisements;
@@ -50,7 +49,7 @@ impl Client {
         op: &UnadvertiseAction<'_>,
         reply: &Reply,
     ) -> Result<(), String> {
-        let name = resolve(&op.action)?;
+        let name = self.resolve(&op.action)?;
         let gone = self.actions.lock().served.remove(&*name);
         match gone {
             Some(_) => self.info(
@@ -79,7 +78,7 @@ impl Client {
     }
 
     fn action_server(&self, action: &str) -> Result<Arc<ActionServer>, String> {
-        let name = resolve(action)?;
+        let name = self.resolve(action)?;
         let server = self.actions.lock().served.get(&*name).cloned();
         server.ok_or_else(|| {
             format!("action {name} is not advertised by this client; advertise_action it first")

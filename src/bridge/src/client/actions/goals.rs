@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use ros::bus::{GoalEnd, GoalEvents, Outcome};
+use ros::codec;
 use ros::schema::{ActionDef, MessageType};
 use rosbridge::{Compression, GoalStatus, Id, Writer};
 
@@ -148,7 +149,7 @@ impl Goal {
     /// Answers that it was cancelled before its server has heard of it.
     pub(super) fn recalled(&self) {
         if let Some((def, _)) = &self.begun {
-            let nothing = vec![0; def.result.min_size()];
+            let nothing = codec::default_message(&def.result);
             self.succeed(GoalStatus::Canceled, "", &nothing);
         }
     }

@@ -13,9 +13,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::UnderWayGoal;
 use super::goals::{ActionClient, Goal};
-use crate::client::publishing::decode_args;
+use crate::client::decoding::decode_args;
 use crate::client::{Client, Reply};
-use crate::names::resolve;
+use crate::tf;
 
 /// A goal that was read and is to be sent.
 struct Prepared {
@@ -85,7 +85,7 @@ impl Client {
         reply: &Reply,
         compression: Compression,
     ) -> Result<Prepared, String> {
-        let name = resolve(&op.action)?.into_owned();
+        let name = self.resolve(&op.action)?.into_owned();
         self.granted().check(Operation::Call, &name)?;
         let def = self.action_def(&name, &op.action_type)?;
         self.report_surplus(reply, "send_action_goal", &def.goal, op.args);
@@ -123,8 +123,13 @@ impl Client {
         } else if actions.used.len() >= limit {
             return Err(format!("this client uses {limit} actions already"));
         }
-        let opened = self.shared.bus.action_client(name, &def);
-        let bus = opened.map_err(|error| error.to_string())?;
+        let bus = match tf::own_action(&self.shared, name, &def) {
+            Some(own) => own,
+            None => {
+                let opened = self.shared.bus.action_client(name, &def);
+                opened.map_err(|error| error.to_string())?
+            }
+        };
         let action = Arc::new(ActionClient { def, bus });
         let replaced = actions.used.insert(name.to_owned(), action.clone());
         drop(actions);

@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock, Weak};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{ActionHandler, GoalEnd, Outcome};
+use ros::codec;
 use ros::schema::ActionDef;
 use rosbridge::{AdvertiseAction, CancelActionGoal, Compression, Id, Level, Writer};
 
@@ -166,7 +167,7 @@ impl ActionServer {
 
     /// A result of defaults.
     pub(super) fn nothing(&self) -> Bytes {
-        vec![0; self.def.result.min_size()].into()
+        codec::default_message(&self.def.result).into()
     }
 }
 

@@ -1,0 +1,71 @@
+//! What clients send, as serialized messages.
+
+use bytes::Bytes;
+use ros::codec::{self, FillOptions, Time};
+use ros::schema::MessageType;
+use rosbridge::{Compression, Format, Payload};
+
+/// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
+const SLICED: usize = 16 * 1024;
+
+/// A payload as serialized message.
+pub(super) fn decode(
+    message_type: &MessageType,
+    payload: Payload<'_>,
+    compression: Compression,
+    source: Option<&Bytes>,
+) -> Result<Bytes, String> {
+    if compression == Compression::CborRaw {
+        let raw = payload.raw().map_err(|error| error.to_string())?;
+        codec::validate(message_type, &raw.bytes).map_err(|error| error.to_string())?;
+        return Ok(match (&raw.bytes, source) {
+            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
+                source.slice_ref(slice)
+            }
+            _ => Bytes::from(raw.bytes.into_owned()),
+        });
+    }
+    let options = FillOptions {
+        now: Some(Time::now()),
+        ..FillOptions::default()
+    };
+    // Base64 shrinks by a quarter; everything else that matters does by more.
+    let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
+    let decoded = match payload.format {
+        Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
+        Format::Cbor => codec::from_cbor(message_type, payload.bytes, &mut out, &options),
+    };
+    decoded.map_err(|error| error.to_string())?;
+    Ok(Bytes::from(out))
+}
+
+/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults, and what a list
+/// has too many is left out.
+pub(super) fn decode_args(
+    message_type: &MessageType,
+    args: Option<Payload<'_>>,
+    compression: Compression,
+) -> Result<Bytes, String> {
+    match args {
+        None if compression == Compression::CborRaw && !message_type.fields().is_empty() => {
+            Err("field \"args\" is missing, the ROS serialization is expected".to_owned())
+        }
+        None => decode(message_type, Payload::json("{}"), Compression::None, None),
+        Some(list) if list.is_list() && compression != Compression::CborRaw => {
+            let fields = message_type.fields();
+            let named = list
+                .named(fields.iter().map(|field| field.name.as_str()))
+                .ok_or("field \"args\" is a list of too many values; name them in an object")?;
+            decode(
+                message_type,
+                Payload {
+                    format: list.format,
+                    bytes: &named,
+                },
+                compression,
+                None,
+            )
+        }
+        Some(args) => decode(message_type, args, compression, None),
+    }
+}

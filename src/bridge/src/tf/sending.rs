@@ -1,0 +1,176 @@
+//! What callers and goals ask for, and its sending.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use ros::codec::Time;
+use ros::schema::MessageType;
+use serde::Deserialize;
+use tokio_util::sync::CancellationToken;
+
+use super::buffer::Found;
+use super::transform::Transform;
+use super::{Buffer, buffer, write_transforms};
+use crate::clock;
+use crate::shared::Shared;
+
+/// Requests served at once.
+const MAX_REQUESTS: usize = 1000;
+const MAX_SOURCES: usize = 1000;
+
+/// What a caller or goal asks for.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(default)]
+pub(super) struct Wanted {
+    source_frames: Vec<String>,
+    target_frame: String,
+    angular_thres: f64,
+    trans_thres: f64,
+    rate: f64,
+    timeout: Timeout,
+}
+
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(default)]
+struct Timeout {
+    #[serde(alias = "sec")]
+    secs: i32,
+    #[serde(alias = "nanosec")]
+    nsecs: i64,
+}
+
+impl Default for Wanted {
+    fn default() -> Self {
+        Self {
+            source_frames: Vec::new(),
+            target_frame: String::new(),
+            angular_thres: 0.0,
+            trans_thres: 0.0,
+            rate: 10.0,
+            timeout: Timeout::default(),
+        }
+    }
+}
+
+impl Wanted {
+    /// How long a topic that nobody listens to is kept.
+    pub(super) fn patience(&self) -> Duration {
+        let Timeout { secs, nsecs } = self.timeout;
+        let patience = Duration::new(
+            u64::try_from(secs).unwrap_or(0),
+            nsecs.clamp(0, 999_999_999) as u32,
+        );
+        patience.clamp(Duration::from_secs(1), Duration::from_secs(3600))
+    }
+}
+
+/// Refuses what is too much.
+pub(super) fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
+    if wanted.source_frames.len() > MAX_SOURCES {
+        return Err(format!(
+            "source_frames has {} entries, at most {MAX_SOURCES} are allowed",
+            wanted.source_frames.len()
+        ));
+    }
+    if requests >= MAX_REQUESTS {
+        return Err(format!(
+            "{MAX_REQUESTS} requests for transforms are served already; cancel some"
+        ));
+    }
+    Ok(())
+}
+
+/// Who listens to this topic: its newest listener.
+pub(super) fn heard_on(topic: &str) -> impl Fn(&Shared) -> Option<u64> + Send + use<> {
+    let topic = topic.to_owned();
+    move |shared| {
+        let live = shared.live_fanouts(&topic);
+        live.iter()
+            .filter_map(|fanout| fanout.newest_listener())
+            .max()
+    }
+}
+
+/// Gives `deliver` what has changed for those who hear it, at the rate asked for, until that says no or `stop` is cancelled.
+/// `heard_by` says who came last of those, if anybody did.
+pub(super) async fn send(
+    shared: Weak<Shared>,
+    buffer: Arc<Buffer>,
+    wanted: Wanted,
+    (heard_by, of): (impl Fn(&Shared) -> Option<u64>, Arc<MessageType>),
+    stop: CancellationToken,
+    mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
+) {
+    let rate = if wanted.rate > 0.0 {
+        wanted.rate.clamp(0.01, 1000.0)
+    } else {
+        10.0
+    };
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / rate));
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let target = buffer::plain(&wanted.target_frame);
+    let mut sent: HashMap<&str, Transform> = HashMap::new();
+    let mut known = None;
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => return,
+            _ = ticks.tick() => {}
+        }
+        let Some(shared) = shared.upgrade() else {
+            return;
+        };
+        // Callers learn the topic's name from the answer and listen only then; whoever comes late wants to hear all.
+        let newest = heard_by(&shared);
+        if newest != known {
+            known = newest;
+            sent.clear();
+        }
+        if known.is_none() {
+            if !deliver(&shared, None) {
+                return;
+            }
+            continue;
+        }
+        let mut changed: Vec<(&str, &str, Transform, Option<Time>)> = Vec::new();
+        for source in wanted
+            .source_frames
+            .iter()
+            .map(|source| buffer::plain(source))
+        {
+            let Some(Found {
+                transform: now,
+                time,
+            }) = buffer.find(target, source)
+            else {
+                continue;
+            };
+            let moved = sent.get(source).is_none_or(|before| {
+                let (metres, radians) = now.distance(before);
+                metres > wanted.trans_thres || radians > wanted.angular_thres
+            });
+            if moved {
+                sent.insert(source, now);
+                changed.push((target, source, now, time));
+            }
+        }
+        // What never moves is there now, too.
+        let now = match changed.iter().any(|(.., time)| time.is_none()) {
+            true => clock::now(&shared).await,
+            false => Time::default(),
+        };
+        let changed: Vec<_> = changed
+            .into_iter()
+            .map(|(target, source, transform, time)| {
+                (target, source, transform, time.unwrap_or(now))
+            })
+            .collect();
+        let transforms = match changed.is_empty() {
+            true => None,
+            false => write_transforms(&of, changed).ok(),
+        };
+        if !deliver(&shared, transforms) {
+            return;
+        }
+    }
+}
