@@ -49,8 +49,11 @@ struct Lab {
     wheels: Vec<&'static str>,
 }
 
+/// A file in a wheel: its path, its text, and whether it is a program.
+type Packed<'a> = (&'a str, &'a str, bool);
+
 impl Lab {
-    fn new(wheels: &[(&'static str, &[(&str, &str, bool)])]) -> Self {
+    fn new(wheels: &[(&'static str, &[Packed<'_>])]) -> Self {
         let place = tempfile::tempdir().expect("a directory");
         for (name, files) in wheels {
             let path = place.path().join(name);
