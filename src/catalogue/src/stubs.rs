@@ -12,6 +12,8 @@ use package::stub::{
     About, Content, Contents, Files, MANIFEST, PROGRAM, Portal, SIGNATURE, SIGNER, compose,
     manifest,
 };
+use ros::bus::RosVersion;
+use ros::flavour::Flavour;
 use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
@@ -97,6 +99,16 @@ pub fn is_authority(text: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
+/// Refuses a service of a ROS for which there is no stub.
+pub fn check_ros(service: &str, flavour: &Flavour) -> Result<(), Error> {
+    match flavour.ros.bus() {
+        RosVersion::One => Ok(()),
+        RosVersion::Two => Err(Error::StubOfRos2 {
+            service: service.to_owned(),
+        }),
+    }
+}
+
 /// The files of a revision's stub, but for the robot's program.
 pub fn files(
     store: &image::Store,
@@ -105,6 +117,7 @@ pub fn files(
     architecture: &str,
     portal: &Portal,
 ) -> Result<Files, Error> {
+    check_ros(&revision.service, &revision.flavour)?;
     let no_stub = |error: package::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: error.to_string(),
@@ -245,6 +258,8 @@ fn header(kind: EntryType, executable: bool, size: u64) -> Header {
 mod tests {
     use std::io::Read;
 
+    use ros::flavour::Version;
+
     use super::*;
 
     fn packed(key: &SigningKey) -> (Vec<u8>, String) {
@@ -262,6 +277,20 @@ mod tests {
         let mut bytes = Vec::new();
         archive.file.read_to_end(&mut bytes).expect("read");
         (bytes, archive.signature)
+    }
+
+    #[test]
+    fn there_is_no_stub_of_a_service_of_ros_2() {
+        let of = |ros| Flavour {
+            ros,
+            ..Flavour::default()
+        };
+        assert!(check_ros("one", &of(Version::Ros1)).is_ok());
+        let refused = check_ros("two", &of(Version::Ros2)).expect_err("another ROS");
+        assert_eq!(
+            refused.to_string(),
+            "service two is of ROS 2, for which there is no stub"
+        );
     }
 
     #[test]

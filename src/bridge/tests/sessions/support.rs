@@ -8,7 +8,7 @@ use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
 use ros::JoinOptions;
-use ros::bus::{Bus, Publisher, Qos, RosVersion, ServiceType, Subscription, WireType};
+use ros::bus::{Bus, Graph, Publisher, Qos, RosVersion, ServiceType, Subscription, WireType};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
 use ros::ros1::master::{Master, MasterOptions};
@@ -16,6 +16,7 @@ use ros::schema::Registry;
 use serde_json::Value;
 use tokio::io::DuplexStream;
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role, WebSocketConfig};
@@ -125,6 +126,8 @@ pub struct World<S> {
     pub node: Arc<dyn Bus>,
     pub registry: Arc<Registry>,
     pub system: S,
+    /// As the bridge sees it.
+    seen: watch::Receiver<Arc<Graph>>,
 }
 
 impl<S: System> World<S> {
@@ -141,12 +144,14 @@ impl<S: System> World<S> {
         let registry = Arc::new(registry);
         let node = system.join("/node").await;
         let bus = system.join("/cloudroid_bridge").await;
+        let seen = bus.graph();
         let bridge = Bridge::new(bus, registry.clone(), options);
         World {
             bridge,
             node,
             registry,
             system,
+            seen,
         }
     }
 
@@ -306,12 +311,12 @@ impl<S: System> World<S> {
             .unwrap()
     }
 
-    /// Waits until the node sees the graph so; the bridge sees it then or soon.
-    pub async fn in_graph(&self, condition: impl Fn(&ros::bus::Graph) -> bool) {
-        let mut graph = self.node.graph();
-        patiently(graph.wait_for(|graph| condition(graph)))
-            .await
-            .unwrap();
+    /// Waits until both the node and the bridge see the graph so.
+    pub async fn in_graph(&self, condition: impl Fn(&Graph) -> bool) {
+        for mut graph in [self.node.graph(), self.seen.clone()] {
+            let seen = patiently(graph.wait_for(|graph| condition(graph))).await;
+            seen.unwrap();
+        }
     }
 }
 
