@@ -12,8 +12,8 @@ use socket2::Socket;
 
 /// Of a receiver's buffer so much is used at most; the rest is for others.
 const PART: (usize, usize) = (5, 8);
-/// What may be sent unasked after a pause: it cannot be much of any buffer.
-const UNASKED: usize = 33 << 10;
+/// What may be sent unasked after a pause, to a receiver that had room: it cannot be much of any buffer.
+const UNASKED: usize = 8 << 10;
 /// What was asked counts for so long.
 const RECENT: Duration = Duration::from_millis(1);
 /// What the kernel adds to a datagram: its own headers and its record of the packet.
@@ -25,6 +25,8 @@ const RECORD: usize = 256;
 struct Credit {
     bytes: usize,
     asked: Instant,
+    /// It had no room when it was looked at last: nothing is sent unasked.
+    full: bool,
 }
 
 /// Looks at receivers.
@@ -68,11 +70,13 @@ impl Flow {
         let credit = self.credits.entry(to).or_insert(Credit {
             bytes: UNASKED,
             asked: now,
+            full: false,
         });
-        if now.saturating_duration_since(credit.asked) > RECENT {
+        if !credit.full && now.saturating_duration_since(credit.asked) > RECENT {
             *credit = Credit {
                 bytes: credit.bytes.max(UNASKED),
                 asked: now,
+                full: false,
             };
         }
         if credit.bytes >= cost {
@@ -92,6 +96,7 @@ impl Flow {
             Credit {
                 bytes: if fits { bytes } else { 0 },
                 asked: now,
+                full: !fits,
             },
         );
         fits
@@ -236,6 +241,22 @@ mod tests {
             flow.room(Instant::now(), to, datagram.len()),
             "there is room again"
         );
+    }
+
+    #[test]
+    fn a_receiver_that_was_full_is_looked_at_however_long_ago_that_was() {
+        let receiver = UdpSocket::bind("127.0.0.1:0").expect("a receiver");
+        let sender = UdpSocket::bind("127.0.0.1:0").expect("a sender");
+        let to = receiver.local_addr().expect("its address");
+        let (mut flow, mut now) = (flow(), Instant::now());
+        let datagram = [7; 1000];
+        while flow.room(now, to, datagram.len()) {
+            sender.send_to(&datagram, to).expect("sending");
+        }
+        for _ in 0..100 {
+            now += 2 * RECENT;
+            assert!(!flow.room(now, to, datagram.len()), "it is still full");
+        }
     }
 
     #[test]
