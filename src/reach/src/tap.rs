@@ -13,8 +13,8 @@ use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd,
-    GoalEvents, Graph, Hearing, Lending, Outcome, Publisher, Qos, RosVersion, ServiceHandler,
-    ServiceType, Subscription, WireType,
+    GoalEvents, Graph, Hearing, Lending, NodeParameters, Outcome, Publisher, Qos, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
@@ -356,6 +356,10 @@ impl Bus for TappedBus {
 
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
         self.bus.parameters()
+    }
+
+    fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        self.bus.node_parameters()
     }
 
     fn lending(&self) -> Result<&dyn Lending, BusError> {

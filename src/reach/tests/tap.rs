@@ -7,7 +7,8 @@ use async_trait::async_trait;
 use budget::Budget;
 use bytes::Bytes;
 use reach::tap::{Answer, Tap, Tapped, Tapping, What};
-use ros::bus::{Bus, ServiceHandler, ServiceType};
+use ros::JoinOptions;
+use ros::bus::{Bus, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -149,4 +150,14 @@ async fn what_may_not_be_held_is_left_out_and_what_is_read_is_given_back() {
     let number = call(&mut tapping, b"hello").await;
     assert_eq!(answer(&mut tapping).await, (number, Answer::GivenUp));
     assert_eq!((tapping.left_out(), budget.used()), (2, 0));
+}
+
+#[tokio::test]
+async fn what_only_one_ros_has_is_offered_behind_a_tap_too() {
+    let options = JoinOptions::in_domain(93, "/bridge");
+    let joined = ros::connect(RosVersion::Two, Arc::new(HostSockets), options).await;
+    let bus = Arc::new(Tap::default()).before(joined.expect("a bus"));
+    assert!(bus.node_parameters().is_ok());
+    assert!(bus.parameters().is_err());
+    bus.close().await;
 }

@@ -20,6 +20,10 @@ impl Engine {
             tracing::trace!(%fault, "a datagram of RTPS was not read to its end");
         }
         for received in parsed.received {
+            // Whoever says anything is there.
+            if let Some(remote) = self.remotes.get_mut(&received.from) {
+                remote.heard = now;
+            }
             let other = received
                 .to
                 .is_some_and(|to| to != self.own.prefix && to != GuidPrefix::UNKNOWN);

@@ -370,6 +370,30 @@ fn who_falls_silent_is_gone_when_the_lease_is_over() {
 }
 
 #[test]
+fn who_says_anything_is_there() {
+    let mut world = World::of(2);
+    let (_, ends) = world.writer(0, keep(10));
+    world.reader(1, keep(10));
+    world.pass(SECOND);
+    // Only its announcements are lost; it is asked for acknowledgements, and gives them.
+    world.loses = Box::new(|_, bytes| {
+        bytes[8] == 2 && bytes.windows(4).any(|ids| ids == EntityId::SPDP_WRITER.0)
+    });
+    let writer = ends.borrow().matched[0].guid;
+    assert_eq!(writer.prefix, GuidPrefix([2; 12]));
+    let ours = *world.engines[0]
+        .writers
+        .keys()
+        .find(|entity| !entity.is_builtin())
+        .expect("a writer");
+    for mark in 0..20 {
+        world.write(Guid::new(GuidPrefix([1; 12]), ours), mark, 8);
+        world.pass(SECOND);
+    }
+    assert_eq!(ends.borrow().matched.len(), 1);
+}
+
+#[test]
 fn whose_port_is_gone_is_dead_at_once() {
     let mut world = World::of(2);
     let (_, ends) = world.writer(0, keep(10));
