@@ -9,4 +9,5 @@
 mod memory_bus;
 mod over_memory;
 mod over_ros1;
+mod over_ros2;
 mod support;

@@ -47,6 +47,14 @@ impl Engine {
             out.push((to, reader.prefix, Submessage::Heartbeat(beat)));
         }
         for (to, reader, start, set) in wanted.gaps {
+            // Its sample was given up, and is still being sent: it will be whole. Fast DDS 2.14 never gets over a word that there
+            // is none of a sample of which it has fragments: whoever takes from that reader then tries for ever.
+            let under_way = self.paths.get(&to).and_then(|path| path.sending(entity));
+            if under_way
+                .is_some_and(|number| number == start || set.iter().any(|gone| gone == number))
+            {
+                continue;
+            }
             let gap = wire::Gap {
                 reader: reader.entity,
                 writer: entity,

@@ -8,7 +8,7 @@ use super::{Datagram, LocalWriter};
 use crate::fragments::{self, FRAGMENT};
 use crate::wire::{self, DataFragHead, DatagramWriter, InlineQos};
 use crate::writer::{Change, Item};
-use crate::{EntityId, GuidPrefix};
+use crate::{EntityId, GuidPrefix, SequenceNumber};
 
 /// What the headers of a datagram with one fragment take, at most, in bytes.
 const HEADERS: usize = 160;
@@ -58,6 +58,12 @@ impl Path {
         self.queues
             .get(&writer)
             .is_some_and(|queue| queue.current.is_some() || !queue.waiting.is_empty())
+    }
+
+    /// The sample of this writer of which some fragments are out and others are not.
+    pub fn sending(&self, writer: EntityId) -> Option<SequenceNumber> {
+        let (item, _) = self.queues.get(&writer)?.current.as_ref()?;
+        Some(item.number)
     }
 
     pub fn forget(&mut self, writer: EntityId) {

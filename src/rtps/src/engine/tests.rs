@@ -3,11 +3,11 @@
 use parking_lot::Mutex;
 
 use super::*;
-use crate::SampleIdentity;
 use crate::locator::Locator;
 use crate::participant::Topic;
 use crate::qos::Reliability;
 use crate::reader::Bounds;
+use crate::{SampleIdentity, wire};
 
 /// What a reader has read.
 #[derive(Default)]
@@ -442,6 +442,38 @@ fn what_was_written_is_sent_though_the_writer_is_dropped() {
     world.pass(SECOND * 4);
     assert_eq!(read.marks(), [0, 1, 2, 3, 4]);
     assert_eq!(ends.borrow().matched.len(), 0);
+}
+
+#[test]
+fn a_sample_on_its_way_is_not_said_to_be_gone() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(1));
+    let (_, _, read) = world.reader(1, keep(1));
+    world.pass(SECOND);
+    // Two fragments of seven are out when the next sample takes its place; the receiver asks for the rest.
+    world.room = Some(33_000);
+    world.write(writer, 1, 100_000);
+    world.carry();
+    world.write(writer, 2, 8);
+    let ask = wire::NackFrag {
+        reader: EntityId::user_reader(1),
+        writer: writer.entity,
+        number: SequenceNumber(1),
+        set: {
+            let mut set = crate::FragmentSet::empty(3);
+            set.insert(3);
+            set
+        },
+        count: 1,
+    };
+    let mut datagram = DatagramWriter::new(GuidPrefix([2; 12]));
+    datagram.destination(GuidPrefix([1; 12]));
+    datagram.nack_frag(&ask);
+    let now = world.now;
+    world.engines[0].receive(now, &datagram.finish().into());
+    world.room = None;
+    world.pass(SECOND);
+    assert_eq!(read.marks(), [1, 2]);
 }
 
 #[test]
