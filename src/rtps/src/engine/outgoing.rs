@@ -35,6 +35,9 @@ impl Engine {
         let last = writer.state.last();
         let mut out = Vec::new();
         for (to, reader, first, asks) in wanted.heartbeats {
+            // What is being sent is not gone, though a newer sample has taken its place here.
+            let under_way = self.paths.get(&to).and_then(|path| path.sending(entity));
+            let first = under_way.map_or(first, |number| first.min(number));
             let beat = wire::Heartbeat {
                 reader: reader.entity,
                 writer: entity,

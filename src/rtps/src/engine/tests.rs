@@ -471,6 +471,8 @@ fn a_sample_on_its_way_is_not_said_to_be_gone() {
     datagram.nack_frag(&ask);
     let now = world.now;
     world.engines[0].receive(now, &datagram.finish().into());
+    // Nor by a heartbeat, which comes before the rest of it does.
+    world.engines[0].tick(now + SECOND);
     world.room = None;
     world.pass(SECOND);
     assert_eq!(read.marks(), [1, 2]);
