@@ -9,5 +9,4 @@
 mod memory_bus;
 mod over_memory;
 mod over_ros1;
-mod over_ros2;
 mod support;

@@ -1,7 +1,6 @@
 //! The world in which the tests happen.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -26,9 +25,6 @@ use crate::memory_bus::MemorySystem;
 
 /// Only bounds how long a failing test takes.
 pub const PATIENCE: Duration = Duration::from_secs(120);
-
-/// Domains whose ports are nobody else's.
-const DOMAINS: u32 = 102;
 
 const DEFINITIONS: &[(&str, &str)] = &[
     ("std_msgs/msg/String", "string data\n"),
@@ -106,34 +102,6 @@ impl System for Ros1 {
 impl Drop for Ros1 {
     fn drop(&mut self) {
         self.master.abort();
-    }
-}
-
-/// A domain of its own for every system: real RTPS on loopback.
-pub struct Ros2 {
-    domain: u16,
-}
-
-#[async_trait]
-impl System for Ros2 {
-    const VERSION: RosVersion = RosVersion::Two;
-    const HOST: &str = "127.0.0.1";
-
-    async fn start() -> Self {
-        static STARTED: AtomicU16 = AtomicU16::new(0);
-        let number = STARTED.fetch_add(1, Ordering::Relaxed);
-        // Other processes may be testing; beyond 101 the ports of a domain are among those that the kernel gives away.
-        let first = std::process::id().wrapping_mul(37) % DOMAINS;
-        let domain = (first + u32::from(number)) % DOMAINS;
-        Self {
-            domain: domain as u16,
-        }
-    }
-
-    async fn join(&self, node: &str) -> Arc<dyn Bus> {
-        let options = JoinOptions::in_domain(self.domain, node);
-        let joined = ros::connect(RosVersion::Two, Arc::new(HostSockets), options);
-        joined.await.unwrap()
     }
 }
 
