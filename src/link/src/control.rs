@@ -15,6 +15,8 @@ use crate::drops::Drop;
 pub struct Hello {
     /// The stub's own version, for logs.
     pub version: String,
+    /// Which ROS the robot's is; 0, as earlier stubs say, means 1.
+    pub ros: u8,
     /// Made up when the stub's process began: names this life of the node.
     pub run: String,
     /// Counts the connections that this life has tried: one that was overtaken on its way does not displace a later
@@ -311,6 +313,32 @@ pub struct Input {
     pub definition: String,
     /// Newcomers get the last message.
     pub latching: bool,
+    /// What the publisher offers beside that; none where nobody says it (ROS 1).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qos: Option<Qos>,
+}
+
+/// Quality of service of an end of a topic, as far as ends must agree on it. Times in seconds.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Qos {
+    /// Messages may be lost on the way.
+    pub best_effort: bool,
+    /// Newcomers get the last messages.
+    pub transient_local: bool,
+    /// Messages kept; 0: as it is usual.
+    pub depth: usize,
+    /// The longest time between two messages.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub deadline: Option<f64>,
+    /// After so long a message is of no use.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lifespan: Option<f64>,
+    /// The publisher itself says that it is alive, not only its node.
+    pub manual_liveliness: bool,
+    /// Within which time that is said.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lease: Option<f64>,
 }
 
 /// What a node has registered.
@@ -340,6 +368,9 @@ pub struct Output {
     pub type_name: String,
     /// Its hash.
     pub md5: String,
+    /// What the node offers; none where nobody says it (ROS 1).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qos: Option<Qos>,
 }
 
 /// An input.
@@ -355,6 +386,9 @@ pub struct Wanted {
     pub md5: String,
     /// This robot's node is the one that sends it; else another node of the servant does.
     pub feed: bool,
+    /// What the node asks for; none where nobody says it (ROS 1).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qos: Option<Qos>,
 }
 
 /// A service.
@@ -370,6 +404,9 @@ pub struct Served {
     pub type_name: String,
     /// Its hash.
     pub md5: String,
+    /// The hashes of its requests and responses, where ends tell those of each other (ROS 2); else empty.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub halves: Vec<String>,
 }
 
 /// One request's way, times in milliseconds.

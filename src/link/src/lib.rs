@@ -21,6 +21,7 @@
 
 pub mod clock;
 pub mod control;
+mod declared;
 pub mod drops;
 pub mod frame;
 mod incoming;

@@ -202,6 +202,7 @@ impl Robot {
             name: "/map".to_owned(),
             type_name: "nav_msgs/GetMap".to_owned(),
             md5: "abcd".to_owned(),
+            ..Served::default()
         });
         let service = "/map".to_owned();
         self.session.report(&FromRobot::Lent { service, of });

@@ -27,7 +27,7 @@ mod types;
 
 pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, Outcome};
 pub use error::{BusError, CallFate};
-pub use graph::{ActionNodes, Graph, ParameterUse, TopicNodes};
+pub use graph::{ActionNodes, Graph, NodeEnds, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
 pub use matched::{Matched, Offer, Peer, PeerId, Refusal, reaches};
 pub use node_parameters::{

@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use budget::Budget;
 
+use crate::network::Network;
+
 /// A message longer than this ends its connection, unless set otherwise.
 pub const MAX_MESSAGE: usize = 256 << 20;
 /// A message that was begun and is not whole after this time ends its connection, unless set otherwise.
@@ -19,6 +21,8 @@ pub struct JoinOptions {
     pub domain: u16,
     /// What `$ROS_DISTRO` stands for (ROS 2, which does not tell it); may be empty.
     pub distribution: String,
+    /// Where other nodes are (ROS 2).
+    pub network: Network,
     /// The node's absolute name.
     pub node: String,
     /// The host that other nodes reach this one under; the address used towards the Master where `None`.
@@ -37,6 +41,7 @@ impl JoinOptions {
         Self {
             master,
             domain: 0,
+            network: Network::default(),
             distribution: String::new(),
             node: node.to_owned(),
             host: None,

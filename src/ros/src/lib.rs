@@ -13,6 +13,8 @@ pub mod flavour;
 mod identity;
 mod join;
 pub mod net;
+mod network;
+pub mod plumbing;
 pub mod ring;
 pub mod ros1;
 pub mod ros2;
@@ -22,3 +24,4 @@ pub mod turns;
 
 pub use connect::connect;
 pub use join::JoinOptions;
+pub use network::{Interface, Interfaces, Network};

@@ -13,6 +13,8 @@ use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
+use crate::network::Interface;
+
 /// A place in which TCP sockets can be opened: a servant's network namespace, or the host's own.
 #[async_trait]
 pub trait Sockets: Send + Sync + 'static {
@@ -32,6 +34,10 @@ pub trait Sockets: Send + Sync + 'static {
         let _ = shared;
         let what = format!("no datagrams can be received at {address} here");
         Err(io::Error::new(io::ErrorKind::Unsupported, what))
+    }
+    /// The interfaces that are up there, with their IPv4 addresses. Unless said otherwise the place has nothing but `lo`.
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        Ok(vec![Interface::LOOPBACK])
     }
     /// A socket by which the kernel tells of the sockets of this place (`NETLINK_SOCK_DIAG`, sock_diag(7)); none where it
     /// cannot be had.
@@ -150,6 +156,10 @@ impl Sockets for HostSockets {
         socket.set_reuse_address(shared)?;
         socket.bind(&address.into())?;
         UdpSocket::from_std(socket.into())
+    }
+
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        rtps::interfaces()
     }
 
     async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {

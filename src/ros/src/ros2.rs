@@ -10,6 +10,7 @@ mod graph;
 mod interfaces;
 pub mod lifecycle;
 pub mod names;
+mod node_ends;
 mod parameters;
 mod place;
 pub mod process;

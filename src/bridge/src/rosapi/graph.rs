@@ -107,6 +107,8 @@ pub(super) fn shown(mut graph: Graph, grants: &Grants) -> Graph {
         .cloned()
         .collect();
     graph.nodes.retain(|node, _| behind.contains(node));
+    // Nothing that is told to clients is made of them.
+    graph.ends.clear();
     graph
 }
 

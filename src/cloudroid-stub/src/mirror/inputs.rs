@@ -318,6 +318,7 @@ impl Channels {
                 md5: of.digest.to_string(),
                 definition: of.definition.clone(),
                 latching,
+                qos: None,
             }));
             let schema = codec::Schema::of(&of.name, of.digest.as_str());
             mirror.session().opens(channel, topic, schema);

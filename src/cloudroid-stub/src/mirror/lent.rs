@@ -70,12 +70,8 @@ impl LentServices {
             let same = services.get(&service);
             let same = same.filter(|known| known.node == provider.node && known.digest == *digest);
             let channel = same.map(|known| known.channel);
-            let served = Served {
-                channel: channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed)),
-                name: service.clone(),
-                type_name: provider.service_type.name,
-                md5: digest.to_string(),
-            };
+            let channel = channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed));
+            let served = Served::of(channel, &service, &provider.service_type);
             let known = Service {
                 channel: served.channel,
                 node: provider.node,

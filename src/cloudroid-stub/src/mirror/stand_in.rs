@@ -48,19 +48,16 @@ impl Mirror {
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
+            qos: None,
         };
         let input = |(topic, of): (String, WireType)| Wanted {
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
             feed: true,
+            qos: None,
         };
-        let serves = |(name, of): (String, ServiceType)| Served {
-            channel: NOWHERE,
-            name,
-            type_name: of.name,
-            md5: of.digest.to_string(),
-        };
+        let serves = |(name, of): (String, ServiceType)| Served::of(NOWHERE, &name, &of);
         let graph = Graph {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),

@@ -253,6 +253,7 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
         topic: "/map".to_owned(),
         type_name: string_type().name,
         md5: string_type().digest.to_string(),
+        ..Output::default()
     };
     let key = (output.type_name.clone(), output.md5.clone());
     scene.mirror.types.lock().insert(key, string_type());

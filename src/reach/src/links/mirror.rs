@@ -66,6 +66,7 @@ impl Sent {
                     topic: topic.clone(),
                     type_name: wire_type.name,
                     md5: wire_type.digest.to_string(),
+                    qos: None,
                 });
             }
             if listening.contains(topic) {
@@ -75,6 +76,7 @@ impl Sent {
                     type_name: ends.type_name.clone(),
                     md5: known.map_or_else(|| "*".to_owned(), |known| known.md5().to_owned()),
                     feed: hub.feeder(topic).as_deref() == Some(&link.node),
+                    qos: None,
                 });
             }
         }
@@ -157,12 +159,7 @@ impl Sent {
                 entry
             }
         };
-        Some(Served {
-            channel,
-            name: name.to_owned(),
-            type_name: service_type.name,
-            md5: service_type.digest.to_string(),
-        })
+        Some(Served::of(channel, name, &service_type))
     }
 
     /// Forgets what the node has taken back.

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use super::{Qos, ServiceType, WireType};
+
 /// What nodes have registered, seen at one moment.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Graph {
@@ -17,8 +19,23 @@ pub struct Graph {
     pub nodes: BTreeMap<String, String>,
     /// Every global parameter that a node asked for or wrote, with the nodes that did.
     pub parameters: BTreeMap<String, ParameterUse>,
-    /// Services that nodes looked for when there were none, with those nodes. Told by our own Master only.
+    /// Services that nodes looked for when there were none, with those nodes. Told by our own Master, and by ROS 2.
     pub sought: BTreeMap<String, Vec<String>>,
+    /// Node → all that it has, with what tools hide, such as the parts of actions. Told by ROS 2 only.
+    pub ends: BTreeMap<String, NodeEnds>,
+}
+
+/// All that one node has, as its ends tell it: by name, with types that have no definition.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct NodeEnds {
+    /// Topics that it publishes. Where it does so several times, the most that it offers.
+    pub publishers: BTreeMap<String, (WireType, Qos)>,
+    /// Topics that it subscribes to. Where it does so several times, the least that it asks for.
+    pub subscribers: BTreeMap<String, (WireType, Qos)>,
+    /// Services that it serves.
+    pub services: BTreeMap<String, ServiceType>,
+    /// Services that it may call.
+    pub clients: BTreeMap<String, ServiceType>,
 }
 
 /// The ends of one topic.

@@ -137,6 +137,12 @@ impl WireType {
         }
     }
 
+    /// The same, written as this version of ROS does.
+    pub fn written_by(self, version: RosVersion) -> Self {
+        let format = WireFormat::of(version);
+        Self { format, ..self }
+    }
+
     /// A type whose definition is known.
     pub fn of(message: &MessageType) -> Self {
         Self {
@@ -205,6 +211,12 @@ impl ServiceType {
             request: Digest::any(),
             response: Digest::any(),
         }
+    }
+
+    /// The same, written as this version of ROS does.
+    pub fn written_by(self, version: RosVersion) -> Self {
+        let format = WireFormat::of(version);
+        Self { format, ..self }
     }
 
     /// A type whose definition is known.

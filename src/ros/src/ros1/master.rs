@@ -191,6 +191,7 @@ impl Inner {
                 .map(|(key, used)| (key.clone(), used.clone()))
                 .collect(),
             sought: state.sought.clone(),
+            ends: BTreeMap::new(),
         }
     }
 

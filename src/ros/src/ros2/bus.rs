@@ -101,7 +101,14 @@ impl Ros2Bus {
         if !names::is_global(&options.node) {
             return Err(BusError::BadName(options.node));
         }
+        let network = options.network;
         let config = Config {
+            interfaces: network.interfaces,
+            multicast: network.multicast,
+            alone: network.alone,
+            peers: network.peers,
+            well_known: network.well_known,
+            servers: network.servers,
             user_data: Bytes::from_static(USER_DATA),
             max_sample: options.max_message,
             budget: options.budget,

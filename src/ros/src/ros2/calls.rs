@@ -11,8 +11,8 @@ use tokio::time::timeout;
 use super::bus::Inner;
 pub(super) use super::client::Client;
 use super::seen::Seen;
-use super::{names, services, type_hash};
-use crate::bus::{BusError, Digest, ServiceType, WireFormat};
+use super::{names, node_ends, services};
+use crate::bus::{BusError, Digest, ServiceType};
 
 /// For a service that somebody has just begun to serve to be discovered.
 pub(super) const GRACE: Duration = Duration::from_millis(300);
@@ -68,18 +68,8 @@ pub(super) async fn find(
 
 fn served(seen: &Seen, service: &str) -> Option<ServiceType> {
     let request = seen.readers(&names::request_name(service));
-    request.iter().find_map(|end| {
-        let writers = seen.writers(&names::reply_name(service));
-        let reply = writers.iter().find(|it| it.guid.prefix == end.guid.prefix);
-        let response = reply.map(|reply| type_hash::of_message(&reply.user_data));
-        Some(ServiceType {
-            name: names::service_type_of(&end.type_name)?,
-            format: WireFormat::Cdr,
-            digest: type_hash::of_service(&end.user_data),
-            request: type_hash::of_message(&end.user_data),
-            response: response.unwrap_or_else(Digest::any),
-        })
-    })
+    let mut servers = request.iter();
+    servers.find_map(|end| node_ends::service_type(seen, end, service, false))
 }
 
 /// Clients that are kept, by service and type.

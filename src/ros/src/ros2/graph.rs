@@ -6,6 +6,7 @@ use rtps::Guid;
 
 use super::ends::OwnEnds;
 use super::names::{self, Named};
+use super::node_ends;
 use super::seen::Seen;
 use crate::bus::{ActionNodes, Graph, TopicNodes};
 
@@ -25,6 +26,7 @@ pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid
         building.add(&end);
     }
     let mut graph = building.graph;
+    graph.ends = node_ends::all(seen);
     let served = &graph.services;
     let sought = building.sought.into_iter();
     graph.sought = sought

@@ -9,6 +9,8 @@
 //!        └── shutdown from each of them ──▶ finalized
 //! ```
 
+mod begin;
+
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,6 +24,8 @@ use crate::bus::{
 use crate::codec::cursor::Cursor;
 use crate::codec::put::Put;
 use crate::ros2::interfaces;
+
+pub use begin::{Begun, NotBegun, begin_all};
 
 /// For a node to answer what takes it no time.
 const PATIENCE: Duration = Duration::from_secs(10);

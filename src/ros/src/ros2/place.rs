@@ -6,6 +6,7 @@ use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use rtps::Interface;
 use tokio::net::UdpSocket;
 
 use crate::net::Sockets;
@@ -17,6 +18,10 @@ pub(super) struct Place(pub(super) Arc<dyn Sockets>);
 impl rtps::Place for Place {
     async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         self.0.datagrams(address, shared).await
+    }
+
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        self.0.interfaces().await
     }
 
     async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {

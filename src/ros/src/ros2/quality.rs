@@ -2,6 +2,7 @@
 
 use rtps::{Durability, EndpointData, EndpointQos, History, Liveliness, Mismatch, Reliability};
 
+use super::node_ends::DEPTH;
 use crate::bus::{self, Qos};
 
 /// What decides which publishers a subscription hears: in no other policy does it ask for anything.
@@ -57,6 +58,50 @@ pub(super) fn endpoint(quality: Quality, depth: usize) -> EndpointQos {
         history: History::KeepLast(u32::try_from(depth.max(1)).unwrap_or(u32::MAX)),
         ..EndpointQos::default()
     }
+}
+
+/// What an end of another node says of itself.
+pub(super) fn of_end(qos: &EndpointQos) -> Qos {
+    Qos {
+        reliability: match qos.reliability {
+            Reliability::Reliable => bus::Reliability::Reliable,
+            Reliability::BestEffort => bus::Reliability::BestEffort,
+        },
+        durability: match qos.durability {
+            Durability::Volatile => bus::Durability::Volatile,
+            _ => bus::Durability::TransientLocal,
+        },
+        depth: match qos.history {
+            History::KeepLast(depth) => usize::try_from(depth).unwrap_or(usize::MAX).max(1),
+            History::KeepAll => DEPTH,
+        },
+        deadline: qos.deadline,
+        lifespan: qos.lifespan,
+        liveliness: match qos.liveliness {
+            Liveliness::ManualByTopic => bus::Liveliness::ManualByTopic,
+            _ => bus::Liveliness::Automatic,
+        },
+        lease: qos.lease,
+    }
+}
+
+/// What two ends of one node on one topic are as one: a publisher offers the most of both, a subscriber asks for the least.
+pub(super) fn joined(one: Qos, two: Qos, publishes: bool) -> Qos {
+    let reliable = [one, two].map(|it| it.reliability == bus::Reliability::Reliable);
+    let latching = [one, two].map(|it| it.is_latching());
+    let both = |of: [bool; 2]| match publishes {
+        true => of[0] || of[1],
+        false => of[0] && of[1],
+    };
+    let joined = Qos {
+        reliability: match both(reliable) {
+            true => bus::Reliability::Reliable,
+            false => bus::Reliability::BestEffort,
+        },
+        depth: one.depth.max(two.depth),
+        ..one
+    };
+    joined.latching(both(latching))
 }
 
 /// Why no messages pass between a writer and a reader, with all that both say.
