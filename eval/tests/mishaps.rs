@@ -217,7 +217,10 @@ fn recordings_that_are_not_there_are_named() {
     let _one = one_at_a_time();
     let (_place, target, temporary) = directories();
     let mut command = Command::new("unshare");
-    let script = "mount -t tmpfs none /usr/share/mrpt && mount -t tmpfs none /usr/share/doc && exec \"$0\" --quick --only 3,7 --target \"$2\"";
+    // Hidden from this process alone; on a fresh machine the first was never there.
+    let script = "for place in /usr/share/mrpt /usr/share/doc; do \
+                      if [ -d $place ]; then mount -t tmpfs none $place || exit; fi; \
+                  done; exec \"$0\" --quick --only 3,7 --target \"$2\"";
     command.args(["--mount", "sh", "-c", script, env!("CARGO_BIN_EXE_eval")]);
     let (status, said) = Evaluation::of(command, &target, &temporary, 0.0).ends();
     assert_eq!(status.code(), Some(1), "{said}");
