@@ -4,6 +4,7 @@
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -14,8 +15,9 @@ use hickory_resolver::proto::rr::{Name, RecordType};
 use hickory_resolver::system_conf::read_system_conf;
 use hickory_resolver::{Hosts, TokioResolver};
 use mdns_sd::{HostnameResolutionEvent, ServiceDaemon};
+use ros::Interface;
 use ros::net::{HostSockets, Sockets};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
 
 /// For a host of this network to answer; it is asked at 0 and 1 s.
 const MULTICAST: Duration = Duration::from_millis(1800);
@@ -39,6 +41,18 @@ impl Sockets for RobotSockets {
 
     async fn resolve(&self, host: &str, port: u16) -> io::Result<SocketAddr> {
         Ok(SocketAddr::new(resolve(host).await?, port))
+    }
+
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        HostSockets.datagrams(address, shared).await
+    }
+
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        HostSockets.interfaces().await
+    }
+
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        HostSockets.diagnostics().await
     }
 }
 

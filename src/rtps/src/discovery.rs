@@ -9,7 +9,6 @@ mod policies;
 #[cfg(test)]
 mod tests;
 
-use std::net::SocketAddr;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -62,17 +61,4 @@ pub struct EndpointData {
     pub unicast: Vec<Locator>,
     /// A reader that wants each sample to tell its quality of service.
     pub expects_inline_qos: bool,
-}
-
-/// The first address of UDP among locators: one of this machine first, where there is one.
-pub(crate) fn reachable(locators: &[Locator]) -> Option<SocketAddr> {
-    let all = || {
-        locators
-            .iter()
-            .filter_map(Locator::udp)
-            .filter(|address| !address.ip().is_multicast())
-    };
-    all()
-        .find(|address| address.ip().is_loopback())
-        .or_else(|| all().next())
 }

@@ -18,13 +18,12 @@ use tokio::sync::Notify;
 
 use crate::engine::{Datagram, Engine};
 use crate::flow::Flow;
+use crate::locator::MULTICAST;
+use crate::network::Network;
 
-/// A receiver without room is looked at again after this time. Timers of tokio count in milliseconds, in which a receiver's buffer
-/// runs empty several times; hence a timer of the kernel.
-const LOOK_AGAIN: Timespec = Timespec {
-    tv_sec: 0,
-    tv_nsec: 60_000,
-};
+/// Timers of tokio count in milliseconds, in which a receiver's buffer runs empty several times; hence a timer of the kernel, which
+/// zero would stop.
+const SHORTEST: Duration = Duration::from_micros(10);
 /// How often it is looked which ports are bound.
 const PORTS: Duration = Duration::from_millis(200);
 /// Datagrams that are taken at once from one socket, before others have their turn.
@@ -38,6 +37,8 @@ const COPIED: usize = 16 << 10;
 pub(crate) struct Core {
     pub engine: Engine,
     flow: Flow,
+    /// Out of which interfaces is sent what is said to all.
+    network: Network,
     /// A datagram for which the sending socket had no room.
     stalled: Option<Datagram>,
 }
@@ -54,36 +55,75 @@ pub(crate) struct Shared {
     multicast: Option<UdpSocket>,
 }
 
+/// The sockets of a participant.
+pub(crate) struct Sockets {
+    pub discovery: UdpSocket,
+    pub user: UdpSocket,
+    pub multicast: Option<UdpSocket>,
+}
+
 /// Why something waits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Waits {
     Nothing,
-    /// Receivers have no room.
-    Receivers,
+    /// Receivers have no room; when to look again.
+    Receivers(Duration),
     /// The sending socket has none.
     Socket,
 }
 
 impl Shared {
-    pub fn new(
-        engine: Engine,
-        flow: Flow,
-        discovery: UdpSocket,
-        user: UdpSocket,
-        multicast: Option<UdpSocket>,
-    ) -> Arc<Self> {
+    pub fn new(engine: Engine, flow: Flow, sockets: Sockets, network: Network) -> Arc<Self> {
+        let Sockets {
+            discovery,
+            user,
+            multicast,
+        } = sockets;
         let core = Mutex::new(Core {
             engine,
             flow,
+            network: Network::new(Vec::new()),
             stalled: None,
         });
-        Arc::new(Self {
+        let shared = Self {
             core,
             wake: Notify::new(),
             discovery,
             user,
             multicast,
-        })
+        };
+        shared.join_groups(&mut shared.core.lock(), network);
+        Arc::new(shared)
+    }
+
+    /// The interfaces of this machine, as they are now.
+    pub fn network_is(&self, network: Network) {
+        let mut core = self.core.lock();
+        if core.network != network {
+            tracing::debug!(?network, "the networks of a DDS participant have changed");
+            core.engine.network_changed(Instant::now(), network.clone());
+            self.join_groups(&mut core, network);
+            self.wake.notify_one();
+        }
+    }
+
+    /// Hears what is said to all in each of these networks.
+    fn join_groups(&self, core: &mut Core, network: Network) {
+        core.flow.set_own(network.addresses());
+        if let Some(socket) = &self.multicast {
+            let socket = SockRef::from(socket);
+            for address in network.addresses() {
+                match socket.join_multicast_v4(&MULTICAST, &address) {
+                    Ok(()) => {}
+                    // It had this address before, and has it again.
+                    Err(error) if error.kind() == io::ErrorKind::AddrInUse => {}
+                    Err(error) => {
+                        tracing::debug!(%error, %address, "DDS participants are not heard by multicast there");
+                    }
+                }
+            }
+        }
+        core.network = network;
     }
 
     /// Does something with the engine, and sends at once what can be sent.
@@ -107,19 +147,21 @@ impl Shared {
         let Core {
             engine,
             flow,
+            network,
             stalled,
         } = core;
+        flow.take_wait();
         loop {
             let next = stalled.take().or_else(|| {
                 engine.transmit(&mut |to, length| flow.room(Instant::now(), to, length))
             });
             let Some(datagram) = next else {
-                return if engine.is_waiting() {
-                    Waits::Receivers
-                } else {
-                    Waits::Nothing
-                };
+                return flow.take_wait().map_or(Waits::Nothing, Waits::Receivers);
             };
+            if datagram.to.ip().is_multicast() {
+                self.send_to_all(&datagram, network);
+                continue;
+            }
             match SockRef::from(&self.user).send_to_vectored(&datagram.parts(), &datagram.to.into())
             {
                 Ok(_) => {}
@@ -133,20 +175,34 @@ impl Shared {
         }
     }
 
+    /// Sends a datagram out of each interface. One that cannot be sent is said again with the next announcement.
+    fn send_to_all(&self, datagram: &Datagram, network: &Network) {
+        let socket = SockRef::from(&self.user);
+        for address in network.addresses() {
+            let sent = socket
+                .set_multicast_if_v4(&address)
+                .and_then(|()| socket.send_to_vectored(&datagram.parts(), &datagram.to.into()));
+            if let Err(error) = sent {
+                tracing::trace!(%error, %address, "nothing was said to all there");
+            }
+        }
+    }
+
     /// Takes what has come on a socket.
     fn take(&self, socket: &UdpSocket, buffer: &mut Vec<u8>) {
         let mut came = Vec::with_capacity(AT_ONCE);
         while came.len() < AT_ONCE {
             buffer.resize(LONGEST, 0);
-            let Ok(length) = socket.try_recv(buffer) else {
+            let Ok((length, source)) = socket.try_recv_from(buffer) else {
                 break;
             };
-            came.push(if length <= COPIED {
+            let datagram = if length <= COPIED {
                 Bytes::copy_from_slice(&buffer[..length])
             } else {
                 buffer.truncate(length);
                 Bytes::from(std::mem::take(buffer))
-            });
+            };
+            came.push((source.ip(), datagram));
         }
         if came.is_empty() {
             return;
@@ -154,8 +210,8 @@ impl Shared {
         let deliveries = {
             let mut core = self.core.lock();
             let now = Instant::now();
-            for datagram in &came {
-                core.engine.receive(now, datagram);
+            for (source, datagram) in &came {
+                core.engine.receive(now, *source, datagram);
             }
             if core.engine.tick_at() <= now {
                 core.engine.tick(now);
@@ -209,14 +265,14 @@ pub(crate) async fn drive(shared: Arc<Shared>) {
             let waits = shared.flush(&mut core);
             (waits, core.engine.tick_at())
         };
-        if waits == Waits::Receivers {
+        if let Waits::Receivers(wait) = waits {
             let nothing = Timespec {
                 tv_sec: 0,
                 tv_nsec: 0,
             };
             let once = Itimerspec {
                 it_interval: nothing,
-                it_value: LOOK_AGAIN,
+                it_value: Timespec::try_from(wait.max(SHORTEST)).unwrap_or(nothing),
             };
             if let Err(error) = timerfd_settime(timer.get_ref(), TimerfdTimerFlags::empty(), &once)
             {
@@ -233,7 +289,7 @@ pub(crate) async fn drive(shared: Arc<Shared>) {
             Ok(()) = shared.user.readable() => shared.take(&shared.user, &mut buffer),
             Ok(()) = shared.discovery.readable() => shared.take(&shared.discovery, &mut buffer),
             Ok(socket) = multicast => shared.take(socket, &mut buffer),
-            Ok(mut ready) = timer.readable(), if waits == Waits::Receivers => {
+            Ok(mut ready) = timer.readable(), if matches!(waits, Waits::Receivers(_)) => {
                 let mut expirations = [0; 8];
                 let _ = rustix::io::read(timer.get_ref(), &mut expirations);
                 ready.clear_ready();

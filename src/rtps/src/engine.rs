@@ -13,14 +13,16 @@ mod discovering;
 mod ends;
 mod incoming;
 mod matching;
+mod networks;
 mod outgoing;
 mod paths;
+mod ports;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::io::IoSlice;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -31,6 +33,7 @@ pub(crate) use self::discovering::BUILTIN;
 use self::paths::Path;
 use crate::discovery::ParticipantData;
 use crate::locator::Ports;
+use crate::network::Network;
 use crate::participant::{Discovered, Ends, Sample, Sink};
 use crate::qos::{Durability, EndpointQos, History};
 use crate::reader::{Bounds, ReaderState};
@@ -72,6 +75,8 @@ struct Remote {
     discovery: SocketAddr,
     /// Where its ends receive.
     user: SocketAddr,
+    /// The address from which it was heard last.
+    source: IpAddr,
     heard: Instant,
 }
 
@@ -97,6 +102,9 @@ pub(crate) struct Settings {
     pub bounds: Bounds,
     /// Where it announces itself to whoever does not know it yet.
     pub announce_to: Vec<SocketAddr>,
+    pub network: Network,
+    /// Whether it tells nobody of itself, and hears nobody.
+    pub alone: bool,
 }
 
 /// A participant.
@@ -108,8 +116,10 @@ pub(crate) struct Engine {
     announcements: i64,
     announce_at: Instant,
     announce_pause: Duration,
-    /// Which of the domain's ports were bound when they were looked at last.
-    bound: BTreeSet<u16>,
+    network: Network,
+    alone: bool,
+    /// Which of the domain's ports of this machine were bound when they were looked at last.
+    bound: BTreeSet<SocketAddrV4>,
     remotes: HashMap<GuidPrefix, Remote>,
     discovered: Discovered,
     discovered_changed: bool,
@@ -137,6 +147,8 @@ impl Engine {
             ports,
             bounds,
             announce_to,
+            network,
+            alone,
         } = settings;
         let mut engine = Self {
             own,
@@ -146,6 +158,8 @@ impl Engine {
             announcements: 0,
             announce_at: now,
             announce_pause: discovering::FIRST_PAUSE,
+            network,
+            alone,
             bound: BTreeSet::new(),
             remotes: HashMap::new(),
             discovered: Discovered::default(),

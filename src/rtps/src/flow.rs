@@ -1,14 +1,17 @@
 //! How full the receivers' buffers are. Peers on this machine receive into buffers of some 200 kB by default, which a picture sent
 //! at the speed of the loopback device overflows; what does not fit is lost without a word. The kernel tells how much of such a
-//! buffer is in use (`NETLINK_SOCK_DIAG`, sock_diag(7)), so that it is filled up to a part, and no further.
+//! buffer is in use (`NETLINK_SOCK_DIAG`, sock_diag(7)), so that it is filled up to a part, and no further. Where that is not known,
+//! a pace is kept.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{self, Read, Write};
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
 use socket2::Socket;
+
+use crate::pace::Pace;
 
 /// Of a receiver's buffer so much is used at most; the rest is for others.
 const PART: (usize, usize) = (5, 8);
@@ -16,6 +19,8 @@ const PART: (usize, usize) = (5, 8);
 const UNASKED: usize = 8 << 10;
 /// What was asked counts for so long.
 const RECENT: Duration = Duration::from_millis(1);
+/// A receiver without room is looked at again after this time.
+const LOOK_AGAIN: Duration = Duration::from_micros(60);
 /// What the kernel adds to a datagram: its own headers and its record of the packet.
 const OVERHEAD: usize = 448;
 const RECORD: usize = 256;
@@ -33,7 +38,12 @@ struct Credit {
 #[derive(Debug)]
 pub(crate) struct Flow {
     diagnostics: Option<Socket>,
+    /// Addresses of this machine beside the loopback device's.
+    own: BTreeSet<Ipv4Addr>,
     credits: HashMap<SocketAddr, Credit>,
+    pace: Pace,
+    /// When one of those without room is to be looked at again; none where all had room.
+    wait: Option<Duration>,
     answer: Vec<u8>,
 }
 
@@ -47,7 +57,10 @@ impl Flow {
         }
         Self {
             diagnostics,
+            own: BTreeSet::new(),
             credits: HashMap::new(),
+            pace: Pace::default(),
+            wait: None,
             answer: vec![0; 32 << 10],
         }
     }
@@ -57,15 +70,41 @@ impl Flow {
         self.diagnostics.is_some()
     }
 
+    /// These are the addresses of this machine now.
+    pub fn set_own(&mut self, own: impl Iterator<Item = Ipv4Addr>) {
+        self.own = own.collect();
+    }
+
+    /// After which time those are to be looked at again that had no room since this was asked last.
+    pub fn take_wait(&mut self) -> Option<Duration> {
+        self.wait.take()
+    }
+
     /// Whether a receiver can take a datagram of so many bytes now; it is counted as sent if so.
     pub fn room(&mut self, now: Instant, to: SocketAddr, length: usize) -> bool {
-        // A network card and its queue keep the pace of what goes to other machines.
-        let SocketAddr::V4(address) = to else {
-            return true;
+        let wait = match self.seen(to) {
+            Some(at) if self.has_room(now, at, length) => return true,
+            Some(_) => LOOK_AGAIN,
+            None => match self.pace.room(now, to, length) {
+                Ok(()) => return true,
+                Err(wait) => wait,
+            },
         };
-        if !address.ip().is_loopback() || self.diagnostics.is_none() {
-            return true;
-        }
+        self.wait = Some(self.wait.map_or(wait, |before| before.min(wait)));
+        false
+    }
+
+    /// The address of a receiver whose buffer can be looked at: one of this machine.
+    fn seen(&self, to: SocketAddr) -> Option<SocketAddrV4> {
+        let SocketAddr::V4(at) = to else {
+            return None;
+        };
+        let here = at.ip().is_loopback() || self.own.contains(at.ip());
+        (here && self.sees()).then_some(at)
+    }
+
+    fn has_room(&mut self, now: Instant, address: SocketAddrV4, length: usize) -> bool {
+        let to = SocketAddr::V4(address);
         let cost = (length + OVERHEAD).next_power_of_two() + RECORD;
         let credit = self.credits.entry(to).or_insert(Credit {
             bytes: UNASKED,
@@ -104,6 +143,7 @@ impl Flow {
 
     /// Forgets receivers that nobody sends to.
     pub fn tidy(&mut self, now: Instant) {
+        self.pace.tidy(now);
         self.credits.retain(|_, credit| {
             now.saturating_duration_since(credit.asked) < Duration::from_secs(10)
         });
@@ -125,13 +165,16 @@ impl Flow {
         Ok(found)
     }
 
-    /// Which of these ports of UDP are bound at the loopback address. One is asked for after the other: a list of all sockets
-    /// costs the kernel a walk through a table of thousands of rows.
-    pub fn bound(&mut self, ports: impl IntoIterator<Item = u16>) -> io::Result<BTreeSet<u16>> {
+    /// At which of these addresses of this machine a socket of UDP receives. One is asked for after the other: a list of all
+    /// sockets costs the kernel a walk through a table of thousands of rows.
+    pub fn bound(
+        &mut self,
+        addresses: impl IntoIterator<Item = SocketAddrV4>,
+    ) -> io::Result<BTreeSet<SocketAddrV4>> {
         let mut bound = BTreeSet::new();
-        for port in ports {
-            if self.ask(Ipv4Addr::LOCALHOST, port)?.is_some() {
-                bound.insert(port);
+        for at in addresses {
+            if self.ask(*at.ip(), at.port())?.is_some() {
+                bound.insert(at);
             }
         }
         Ok(bound)
@@ -263,10 +306,11 @@ mod tests {
     fn bound_ports_are_told_and_gone_ones_are_not() {
         let receiver = UdpSocket::bind("127.0.0.1:0").expect("a receiver");
         let port = receiver.local_addr().expect("its address").port();
+        let at = SocketAddrV4::new(Ipv4Addr::LOCALHOST, port);
         let mut flow = flow();
-        assert_eq!(flow.bound([port]).expect("ports"), BTreeSet::from([port]));
+        assert_eq!(flow.bound([at]).expect("ports"), BTreeSet::from([at]));
         drop(receiver);
-        assert_eq!(flow.bound([port]).expect("ports"), BTreeSet::new());
+        assert_eq!(flow.bound([at]).expect("ports"), BTreeSet::new());
     }
 
     #[test]

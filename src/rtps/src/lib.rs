@@ -22,6 +22,8 @@ mod flow;
 mod fragments;
 mod guid;
 mod locator;
+mod network;
+mod pace;
 mod participant;
 mod qos;
 mod reader;
@@ -32,6 +34,7 @@ mod writer;
 
 pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
+pub use network::{Interface, Interfaces, interfaces};
 pub use participant::{
     Config, Discovered, Ends, JoinError, Participant, Place, Reader, Sample, Sink, Topic, Writer,
 };

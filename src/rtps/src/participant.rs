@@ -16,10 +16,11 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use crate::discovery::{EndpointData, ParticipantData};
-use crate::driver::{Shared, drive};
+use crate::driver::{Shared, Sockets, drive};
 use crate::engine::{BUILTIN, Engine, Settings};
 use crate::flow::Flow;
-use crate::locator::{Locator, MULTICAST, Ports};
+use crate::locator::{MULTICAST, Ports};
+use crate::network::{Interface, Interfaces, Network};
 use crate::qos::{EndpointQos, Mismatch};
 use crate::reader::Bounds;
 use crate::sequence::SequenceNumber;
@@ -32,6 +33,10 @@ pub trait Place: Send + Sync + 'static {
     /// A socket bound to this address as seen from inside; port 0 picks a free one. With `shared` others may be bound to it, too
     /// (`SO_REUSEADDR`), for multicast.
     async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket>;
+    /// The interfaces that are up there, with their addresses: see [`interfaces`](crate::interfaces).
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        Ok(vec![Interface::LOOPBACK])
+    }
     /// A socket of the kernel's diagnostics of sockets (`NETLINK_SOCK_DIAG`) of this place, by which it is seen how full the
     /// receivers' buffers are; none where it cannot be had, and then samples are sent at a fixed pace.
     async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
@@ -54,12 +59,18 @@ pub struct Config {
     pub budget: Budget,
     /// A sample whose fragments stop coming for so long is given up.
     pub unfinished: Duration,
-    /// The addresses of this machine under which others reach it; `127.0.0.1` alone where nobody is outside.
-    pub addresses: Vec<Ipv4Addr>,
+    /// In which networks it takes part: those of this machine's interfaces.
+    pub interfaces: Interfaces,
+    /// Whether others are told of it, and heard, by multicast.
+    pub multicast: bool,
+    /// Whether it tells nobody of itself, and hears nobody.
+    pub alone: bool,
     /// Whether to take ports that others try without having been told of them (9.6.2.3).
     pub well_known: bool,
-    /// Where to announce oneself beside: other participants' ports for discovery.
+    /// Where to announce oneself beside: other participants' ports for discovery; those that the first 32 of a machine have, where the port is 0.
     pub peers: Vec<SocketAddr>,
+    /// Discovery servers of Fast DDS: where there are some, others are known by them alone.
+    pub servers: Vec<SocketAddr>,
 }
 
 impl Config {
@@ -72,9 +83,12 @@ impl Config {
             max_sample: 256 << 20,
             budget: Budget::unlimited(),
             unfinished: Duration::from_secs(30),
-            addresses: vec![Ipv4Addr::LOCALHOST],
+            interfaces: Interfaces::default(),
+            multicast: true,
+            alone: false,
             well_known: false,
             peers: Vec::new(),
+            servers: Vec::new(),
         }
     }
 }
@@ -163,12 +177,23 @@ pub struct Participant {
 struct Running {
     shared: Arc<Shared>,
     task: AbortHandle,
+    /// Looks which interfaces there are.
+    looking: Option<AbortHandle>,
     guid: Guid,
+}
+
+impl Running {
+    fn stop(&self) {
+        self.task.abort();
+        if let Some(looking) = &self.looking {
+            looking.abort();
+        }
+    }
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
-        self.task.abort();
+        self.stop();
     }
 }
 
@@ -182,8 +207,9 @@ impl Participant {
     /// There is no such domain, or no socket could be opened.
     pub async fn join(place: Arc<dyn Place>, config: Config) -> Result<Participant, JoinError> {
         let ports = Ports::of(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
-        let here = match config.addresses[..] {
-            [one] => one,
+        let network = look(&*place, &config.interfaces).await;
+        let here = match &config.interfaces {
+            Interfaces::These(these) if these.len() == 1 => these[0],
             _ => Ipv4Addr::UNSPECIFIED,
         };
         let (discovery, user) = if config.well_known {
@@ -195,26 +221,27 @@ impl Participant {
                 place.datagrams(any, false).await?,
             )
         };
-        let multicast = match multicast(&*place, &config, ports, &user).await {
-            Ok(socket) => Some(socket),
-            Err(error) => {
-                tracing::debug!(%error, "DDS participants are not heard by multicast");
-                None
-            }
+        let multicast = match config.multicast && !config.alone {
+            true => multicast(&*place, ports).await,
+            false => None,
         };
         let diagnostics = place.diagnostics().await.unwrap_or_else(|error| {
             tracing::debug!(%error, "it is not known how full receivers of DDS are");
             None
         });
         let flow = Flow::new(diagnostics);
-        let own = own_data(&config, &discovery, &user)?;
-        let mut announce_to = config.peers.clone();
+        let own = own_data(&config, &network, &discovery, &user)?;
+        let mut announce_to = peers(&config.peers, ports);
+        announce_to.extend(&config.servers);
         if multicast.is_some() {
             announce_to.push(SocketAddr::from((MULTICAST, ports.discovery_multicast())));
         }
         if !flow.sees() {
-            let numbers = (0..UNSEEN).filter_map(|number| ports.discovery(number));
-            announce_to.extend(numbers.map(|port| SocketAddr::from((Ipv4Addr::LOCALHOST, port))));
+            let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+            announce_to.extend(peers(&[here], ports));
+        }
+        if config.alone {
+            announce_to.clear();
         }
         let bounds = Bounds {
             max_sample: config.max_sample,
@@ -228,13 +255,29 @@ impl Participant {
                 ports,
                 bounds,
                 announce_to,
+                network: network.clone(),
+                alone: config.alone,
             },
         );
         let guid = engine.guid();
-        let shared = Shared::new(engine, flow, discovery, user, multicast);
+        let sockets = Sockets {
+            discovery,
+            user,
+            multicast,
+        };
+        let shared = Shared::new(engine, flow, sockets, network);
         let task = tokio::spawn(drive(Arc::clone(&shared))).abort_handle();
+        let looking = (!config.interfaces.is_loopback()).then(|| {
+            let looking = look_again(Arc::clone(&shared), place, config.interfaces);
+            tokio::spawn(looking).abort_handle()
+        });
         Ok(Participant {
-            running: Arc::new(Running { shared, task, guid }),
+            running: Arc::new(Running {
+                shared,
+                task,
+                looking,
+                guid,
+            }),
         })
     }
 
@@ -296,15 +339,56 @@ impl Participant {
     /// Says good-bye. Ends that are still held become inert.
     pub async fn close(&self) {
         self.running.shared.with(|_, engine| engine.close());
-        self.running.task.abort();
+        self.running.stop();
     }
 }
 
 /// How often it is looked whether all has come, where somebody waits for that.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// Without a look at the ports that are bound, participants with these numbers are told of us, bound or not.
-const UNSEEN: u16 = 16;
+/// How often it is looked which interfaces there are: a network that comes is used after this time.
+const INTERFACES: Duration = Duration::from_secs(2);
+
+/// Where nobody tells which participants a machine has, those with the first numbers are told of us; as many as ROS 2's nodes try.
+const UNSEEN: u16 = 32;
+
+/// The interfaces that are meant, as they are now.
+async fn look(place: &dyn Place, meant: &Interfaces) -> Network {
+    if let (Interfaces::These(these), true) = (meant, meant.is_loopback()) {
+        let loopback = |address: &Ipv4Addr| Interface {
+            address: *address,
+            ..Interface::LOOPBACK
+        };
+        return Network::new(these.iter().map(loopback).collect());
+    }
+    let found = place.interfaces().await.unwrap_or_else(|error| {
+        tracing::debug!(%error, "the interfaces of this machine are not known");
+        Vec::new()
+    });
+    Network::new(meant.among(found))
+}
+
+/// Follows the interfaces of a place.
+async fn look_again(shared: Arc<Shared>, place: Arc<dyn Place>, meant: Interfaces) {
+    loop {
+        tokio::time::sleep(INTERFACES).await;
+        shared.network_is(look(&*place, &meant).await);
+    }
+}
+
+/// Where to announce oneself to these.
+fn peers(peers: &[SocketAddr], ports: Ports) -> Vec<SocketAddr> {
+    let mut all = Vec::new();
+    for peer in peers {
+        if peer.port() == 0 {
+            let each = (0..UNSEEN).filter_map(|number| ports.discovery(number));
+            all.extend(each.map(|port| SocketAddr::new(peer.ip(), port)));
+        } else {
+            all.push(*peer);
+        }
+    }
+    all
+}
 
 /// Sockets at the first free pair of the ports that participants of a domain have (9.6.2.3).
 async fn well_known(
@@ -332,41 +416,27 @@ async fn well_known(
     Err(JoinError::Full(config.domain))
 }
 
-/// A socket that hears announcements to all. What `user` sends to all goes out by the first address.
-async fn multicast(
-    place: &dyn Place,
-    config: &Config,
-    ports: Ports,
-    user: &UdpSocket,
-) -> io::Result<UdpSocket> {
-    let socket = place
-        .datagrams(
-            SocketAddr::from((Ipv4Addr::UNSPECIFIED, ports.discovery_multicast())),
-            true,
-        )
-        .await?;
-    for address in &config.addresses {
-        SockRef::from(&socket).join_multicast_v4(&MULTICAST, address)?;
-    }
-    if let Some(address) = config.addresses.first() {
-        SockRef::from(user).set_multicast_if_v4(address)?;
-    }
-    Ok(socket)
+/// A socket that hears announcements to all, where it is told to in which networks.
+async fn multicast(place: &dyn Place, ports: Ports) -> Option<UdpSocket> {
+    let at = SocketAddr::from((Ipv4Addr::UNSPECIFIED, ports.discovery_multicast()));
+    let opened = place.datagrams(at, true).await;
+    // What comes by networks of others of this machine is not for us.
+    let opened = opened.and_then(|socket| {
+        SockRef::from(&socket).set_multicast_all_v4(false)?;
+        Ok(socket)
+    });
+    opened
+        .map_err(|error| tracing::debug!(%error, "DDS participants are not heard by multicast"))
+        .ok()
 }
 
 fn own_data(
     config: &Config,
+    network: &Network,
     discovery: &UdpSocket,
     user: &UdpSocket,
 ) -> io::Result<ParticipantData> {
     let (discovery, user) = (discovery.local_addr()?.port(), user.local_addr()?.port());
-    let at = |port: u16| {
-        config
-            .addresses
-            .iter()
-            .map(|address| Locator::from((*address, port)))
-            .collect()
-    };
     Ok(ParticipantData {
         prefix: new_prefix(),
         vendor: VendorId::OURS,
@@ -374,8 +444,8 @@ fn own_data(
         domain: Some(u32::from(config.domain)),
         name: config.name.clone(),
         user_data: config.user_data.clone(),
-        discovery: at(discovery),
-        user: at(user),
+        discovery: network.locators(discovery),
+        user: network.locators(user),
         builtin: BUILTIN,
         lease: Some(LEASE),
     })

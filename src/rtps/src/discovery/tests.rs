@@ -1,6 +1,6 @@
 //! What is told is read as it was told; whatever is read ends, and keeps no more than was told.
 
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, SocketAddr};
 
 use proptest::collection::vec;
 use proptest::option;
@@ -280,7 +280,7 @@ fn the_other_byte_order_is_read() {
         ([2, 2], VendorId::CYCLONE, 0xc3f)
     );
     assert_eq!(
-        reachable(&told.discovery),
+        told.discovery[0].udp(),
         Some(SocketAddr::from(([127, 0, 0, 1], 7410)))
     );
     assert_eq!(told.lease, Some(Duration::from_millis(10_500)));

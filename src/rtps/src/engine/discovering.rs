@@ -1,7 +1,7 @@
 //! Who is there: participants announce themselves (8.5.3), and their ends to those that they know (8.5.4).
 
 use std::collections::BTreeSet;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -10,6 +10,7 @@ use tokio::sync::watch;
 
 use super::{Datagram, Engine, LocalReader, LocalWriter, Remote};
 use crate::discovery::{self, EndpointData, ParticipantData};
+use crate::locator::Locator;
 use crate::participant::Sample;
 use crate::reader::ReaderState;
 use crate::wire::{self, InlineQos};
@@ -22,8 +23,6 @@ pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(20);
 const LAST_PAUSE: Duration = Duration::from_secs(3);
 /// How often a newcomer's port is told of us: its socket may be there before whoever reads it.
 const TOLD_AGAIN: Duration = Duration::from_millis(50);
-/// So many of the lowest free numbers of participants are looked at.
-const NUMBERS_AHEAD: usize = 6;
 /// More participants, and more ends of each, are not kept.
 const MOST_PARTICIPANTS: usize = 256;
 const MOST_ENDS: usize = 16_384;
@@ -111,12 +110,10 @@ impl Engine {
             .values()
             .map(|remote| (remote.discovery, remote.data.prefix));
         let unknown = self.announce_to.iter().map(|to| (*to, GuidPrefix::UNKNOWN));
-        let ports = self.bound.iter().map(|port| {
-            (
-                SocketAddr::from(([127, 0, 0, 1], *port)),
-                GuidPrefix::UNKNOWN,
-            )
-        });
+        let ports = self
+            .bound
+            .iter()
+            .map(|at| (SocketAddr::V4(*at), GuidPrefix::UNKNOWN));
         let mut told = BTreeSet::new();
         let all: Vec<_> = known
             .chain(unknown)
@@ -128,7 +125,7 @@ impl Engine {
         }
     }
 
-    fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix, status: u32) {
+    pub(super) fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix, status: u32) {
         self.announcements += 1;
         let key = (status != 0).then(|| self.guid().bytes());
         let data = wire::Data {
@@ -167,81 +164,16 @@ impl Engine {
         }
     }
 
-    // ---- ports of this machine
-
-    /// Ports at which participants may be: those of whom we know, and those that newcomers take first.
-    pub fn ports_to_look_at(&self) -> BTreeSet<u16> {
-        let here = |remote: &Remote| {
-            remote
-                .discovery
-                .ip()
-                .is_loopback()
-                .then(|| remote.discovery.port())
-        };
-        let known: BTreeSet<u16> = self
-            .remotes
-            .values()
-            .filter_map(here)
-            .chain(self.bound.iter().copied())
-            .collect();
-        let taken = |number: &u16| {
-            self.ports
-                .discovery(*number)
-                .is_some_and(|port| known.contains(&port))
-        };
-        // Participants take the lowest number whose ports are free.
-        let free = (0..).filter(|number| !taken(number)).take(NUMBERS_AHEAD);
-        let free: Vec<u16> = free
-            .filter_map(|number| self.ports.discovery(number))
-            .collect();
-        let own = self
-            .own
-            .discovery
-            .iter()
-            .filter_map(|locator| u16::try_from(locator.port).ok());
-        let mut ports: BTreeSet<u16> = known.into_iter().chain(free).collect();
-        own.for_each(|port| {
-            ports.remove(&port);
-        });
-        ports
-    }
-
-    /// Which of [`Self::ports_to_look_at`] are bound: newcomers are told of us at once, and whose port is gone is dead.
-    pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<u16>) {
-        let last = self.ports.discovery(119).unwrap_or(u16::MAX);
-        let found: BTreeSet<u16> = bound
-            .range(self.ports.discovery_multicast()..=last)
-            .copied()
-            .collect();
-        let new: Vec<u16> = found.difference(&self.bound).copied().collect();
-        if !new.is_empty() {
-            for port in new {
-                self.announce_to(
-                    SocketAddr::from(([127, 0, 0, 1], port)),
-                    GuidPrefix::UNKNOWN,
-                    0,
-                );
-            }
-            self.announce_soon(now);
-        }
-        self.bound = found;
-        let dead: Vec<GuidPrefix> = self
-            .remotes
-            .iter()
-            .filter(|(_, remote)| {
-                remote.discovery.ip().is_loopback() && !bound.contains(&remote.discovery.port())
-            })
-            .map(|(prefix, _)| *prefix)
-            .collect();
-        for prefix in dead {
-            self.participant_gone(prefix);
-        }
-        self.tell();
-    }
-
     // ---- others
 
-    pub(super) fn participant_heard(&mut self, now: Instant, from: GuidPrefix, data: &wire::Data) {
+    /// A participant announces itself, from this address.
+    pub(super) fn participant_heard(
+        &mut self,
+        now: Instant,
+        from: GuidPrefix,
+        source: IpAddr,
+        data: &wire::Data,
+    ) {
         if data.inline.status != 0 {
             if let Some(guid) = discovery::guid_of_key(data) {
                 self.participant_gone(guid.prefix);
@@ -266,12 +198,16 @@ impl Engine {
         }
         if let Some(remote) = self.remotes.get_mut(&from) {
             remote.heard = now;
+            remote.source = source;
             if *remote.data == told {
                 return;
             }
-            // Where it is may have changed, and what it has: it is met anew.
-            if remote.data.discovery != told.discovery
-                || remote.data.user != told.user
+            // What it has may have changed, or where it is: then it is met anew, unless it is still there where it was.
+            let left = |told: &[Locator], at: SocketAddr| {
+                !told.iter().filter_map(Locator::udp).any(|it| it == at)
+            };
+            if left(&told.discovery, remote.discovery)
+                || remote.data.user != told.user && left(&told.user, remote.user)
                 || remote.data.builtin != told.builtin
             {
                 self.participant_gone(from);
@@ -284,11 +220,15 @@ impl Engine {
                 return;
             }
         }
-        self.participant_came(now, told);
+        self.participant_came(now, source, told);
     }
 
-    fn participant_came(&mut self, now: Instant, told: ParticipantData) {
-        let Some(discovery) = discovery::reachable(&told.discovery) else {
+    pub(super) fn participant_came(&mut self, now: Instant, source: IpAddr, told: ParticipantData) {
+        let Some(discovery) = self.network.choose(&told.discovery, Some(source)) else {
+            tracing::debug!(
+                %source,
+                "a DDS participant tells no address of UDP over IPv4 that leads to it"
+            );
             return;
         };
         // An address belongs to one process at a time: whoever had it before is gone.
@@ -308,7 +248,10 @@ impl Engine {
             );
             return;
         }
-        let user = discovery::reachable(&told.user).unwrap_or(discovery);
+        let user = self
+            .network
+            .choose(&told.user, Some(discovery.ip()))
+            .unwrap_or(discovery);
         let (prefix, vendor, has) = (told.prefix, told.vendor, told.builtin);
         let data = Arc::new(told);
         self.discovered
@@ -321,6 +264,7 @@ impl Engine {
                 data,
                 discovery,
                 user,
+                source,
                 heard: now,
             },
         );
@@ -426,7 +370,12 @@ impl Engine {
             announcer,
             Engine::change_of_announcement(own.to_bytes()),
         );
-        self.announced.insert(own.guid.entity, number);
+        // Of an end that was announced before, newcomers need the last word alone.
+        if let Some(before) = self.announced.insert(own.guid.entity, number) {
+            if let Some(writer) = self.writers.get_mut(&announcer) {
+                writer.state.forget(before);
+            }
+        }
         self.wake(now);
     }
 

@@ -1,5 +1,6 @@
 //! What comes in: datagrams, each submessage to the ends that it is for.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -13,8 +14,11 @@ use crate::writer::Wanted;
 use crate::{EntityId, Guid, GuidPrefix};
 
 impl Engine {
-    /// Takes a datagram.
-    pub fn receive(&mut self, now: Instant, datagram: &Bytes) {
+    /// Takes a datagram that came from this address.
+    pub fn receive(&mut self, now: Instant, source: IpAddr, datagram: &Bytes) {
+        if self.alone {
+            return;
+        }
         let parsed = wire::parse(datagram);
         if let Some(fault) = parsed.fault {
             tracing::trace!(%fault, "a datagram of RTPS was not read to its end");
@@ -28,13 +32,13 @@ impl Engine {
                 .to
                 .is_some_and(|to| to != self.own.prefix && to != GuidPrefix::UNKNOWN);
             if !other && received.from != self.own.prefix {
-                self.receive_submessage(now, received);
+                self.receive_submessage(now, source, received);
             }
         }
         self.tell();
     }
 
-    fn receive_submessage(&mut self, now: Instant, received: Received) {
+    fn receive_submessage(&mut self, now: Instant, source: IpAddr, received: Received) {
         let Received {
             from,
             vendor: _,
@@ -44,7 +48,7 @@ impl Engine {
         } = received;
         match submessage {
             Submessage::Data(data) if data.writer == EntityId::SPDP_WRITER => {
-                self.participant_heard(now, from, &data)
+                self.participant_heard(now, from, source, &data)
             }
             Submessage::Data(data) => {
                 let writer = Guid::new(from, data.writer);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::Engine;
-use crate::discovery::{self, EndpointData};
+use crate::discovery::EndpointData;
 use crate::participant::Ends;
 use crate::qos::Mismatch;
 use crate::writer::Wanted;
@@ -169,7 +169,8 @@ impl Engine {
     /// Where an end of another participant receives.
     fn address(&self, end: &EndpointData) -> Option<SocketAddr> {
         let remote = self.remotes.get(&end.guid.prefix)?;
-        Some(discovery::reachable(&end.unicast).unwrap_or(remote.user))
+        let own = self.network.choose(&end.unicast, Some(remote.user.ip()));
+        Some(own.unwrap_or(remote.user))
     }
 
     /// Tells whoever waits what has changed since the last time.

@@ -78,7 +78,7 @@ impl Engine {
     }
 
     /// The next datagram to send; none where there is none, or where all that there are have to wait until their receivers
-    /// have room (then [`Self::is_waiting`]). `room` tells whether there is some for a datagram of so many bytes.
+    /// have room. `room` tells whether there is some for a datagram of so many bytes.
     pub fn transmit(
         &mut self,
         room: &mut dyn FnMut(SocketAddr, usize) -> bool,
@@ -119,10 +119,5 @@ impl Engine {
             }
         }
         None
-    }
-
-    /// Whether something waits until its receiver has room.
-    pub fn is_waiting(&self) -> bool {
-        !self.paths.is_empty()
     }
 }

@@ -51,6 +51,14 @@ struct World {
     room: Option<usize>,
 }
 
+const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
+
+/// Ports of this machine.
+fn bound<const N: usize>(ports: [u16; N]) -> BTreeSet<SocketAddrV4> {
+    let at = |port| SocketAddrV4::new(std::net::Ipv4Addr::LOCALHOST, port);
+    ports.into_iter().map(at).collect()
+}
+
 fn discovery_of(index: usize) -> u16 {
     7410 + 2 * index as u16
 }
@@ -99,6 +107,8 @@ impl World {
                 ports,
                 bounds,
                 announce_to,
+                network: Network::new(Vec::new()),
+                alone: false,
             },
         ));
     }
@@ -129,7 +139,7 @@ impl World {
                 }
                 let to = usize::from((datagram.to.port() - 7410) / 2);
                 if let Some(engine) = self.engines.get_mut(to) {
-                    engine.receive(self.now, &bytes);
+                    engine.receive(self.now, HERE, &bytes);
                 }
             }
         }
@@ -400,9 +410,9 @@ fn whose_port_is_gone_is_dead_at_once() {
     world.reader(1, keep(10));
     world.pass(SECOND);
     let now = world.now;
-    world.engines[0].ports_bound(now, &BTreeSet::from([7410, 7411, 7412, 7413]));
+    world.engines[0].ports_bound(now, &bound([7410, 7411, 7412, 7413]));
     assert_eq!(ends.borrow().matched.len(), 1);
-    world.engines[0].ports_bound(now, &BTreeSet::from([7410, 7411]));
+    world.engines[0].ports_bound(now, &bound([7410, 7411]));
     assert_eq!(ends.borrow().matched.len(), 0);
 }
 
@@ -470,7 +480,7 @@ fn a_sample_on_its_way_is_not_said_to_be_gone() {
     datagram.destination(GuidPrefix([1; 12]));
     datagram.nack_frag(&ask);
     let now = world.now;
-    world.engines[0].receive(now, &datagram.finish().into());
+    world.engines[0].receive(now, HERE, &datagram.finish().into());
     // Nor by a heartbeat, which comes before the rest of it does.
     world.engines[0].tick(now + SECOND);
     world.room = None;
@@ -569,7 +579,7 @@ fn datagrams_of_nonsense_change_nothing() {
             bytes[at] = random() as u8;
         }
         bytes.truncate(20 + random() as usize % bytes.len());
-        world.engines[1].receive(now, &bytes.into());
+        world.engines[1].receive(now, HERE, &bytes.into());
         world.engines[1].take_deliveries();
     }
     assert_eq!(ends.borrow().matched.len(), 1);

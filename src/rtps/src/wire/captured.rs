@@ -3,8 +3,15 @@
 
 use super::tests::bytes;
 use super::*;
-use crate::discovery::{guid_of_key, reachable};
+use crate::discovery::guid_of_key;
+use crate::locator::Locator;
+use crate::network::{Interface, Network};
 use crate::{Durability, EndpointData, Guid, History, ParticipantData, Reliability};
+
+/// Where such a participant is reached in its network namespace.
+fn reachable(told: &[Locator]) -> Option<std::net::SocketAddr> {
+    Network::new(vec![Interface::LOOPBACK]).choose(told, None)
+}
 
 macro_rules! captured {
     ($name:literal) => {

@@ -1,0 +1,35 @@
+//! Where nodes of ROS 2 look for each other.
+
+use std::net::SocketAddr;
+
+pub use rtps::{Interface, Interfaces};
+
+/// Where a node looks for others, and is found by them (ROS 2). By default it is in a servant's network, which has nothing but `lo`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Network {
+    /// In which networks it takes part.
+    pub interfaces: Interfaces,
+    /// Whether others are looked for by multicast; those of this machine are found without it.
+    pub multicast: bool,
+    /// Whether it looks for nobody and is found by nobody.
+    pub alone: bool,
+    /// Others that are told of it beside: their ports for discovery, or all those of a host's nodes where the port is 0.
+    pub peers: Vec<SocketAddr>,
+    /// Whether it has ports that others try without having been told of them.
+    pub well_known: bool,
+    /// Discovery servers of Fast DDS. Where there are some, others are known by them alone.
+    pub servers: Vec<SocketAddr>,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            interfaces: Interfaces::default(),
+            multicast: true,
+            alone: false,
+            peers: Vec::new(),
+            well_known: false,
+            servers: Vec::new(),
+        }
+    }
+}
