@@ -105,9 +105,13 @@ build-demo: init web
 	@cargo build --locked --profile demo -p cloudroidd -p cloudroidctl -p cloudroid-stub
 	$(call beside,demo)
 
+.PHONY: demo-ros
+demo-ros:
+	@ROS="$(ROS)" demo/demo --validate
+
 .PHONY: demo
-demo: demo-deps build-demo ## push Debian's people_detect and find people in real pictures; CHECK=1 ends by itself
-	@CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/demo" demo/demo
+demo: demo-ros demo-deps build-demo ## push Debian's people_detect and find people in real pictures; ROS=2 a node of rclpy, CHECK=1 ends by itself
+	@ROS="$(ROS)" CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/demo" demo/demo
 
 .PHONY: test
 test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took

@@ -5,16 +5,14 @@ with a rosbridge beside the node.
 """
 
 import argparse
-import base64
 import queue
 import sys
 import time
 
 import cv2
-import numpy
 import roslibpy
 
-ANSWER_WITHIN = 30.0  # seconds for one frame; a detector under load is slow, never this slow
+from asking import ANSWER_WITHIN, answer_to, await_subscriber, image_message, picture_of, stamp_seconds
 
 
 def frames(video, stills, count):
@@ -38,47 +36,9 @@ def frames(video, stills, count):
         yield path.rsplit("/", 1)[-1], picture
 
 
-def image_message(picture, sequence):
-    """sensor_msgs/Image of a bgr8 picture, as JSON for rosbridge."""
-    height, width = picture.shape[:2]
-    return {
-        "header": {
-            "seq": sequence,
-            "stamp": {"secs": 1000 + sequence, "nsecs": 0},
-            "frame_id": "camera",
-        },
-        "height": height,
-        "width": width,
-        "encoding": "bgr8",
-        "is_bigendian": 0,
-        "step": width * 3,
-        "data": base64.b64encode(numpy.ascontiguousarray(picture)).decode(),
-    }
-
-
-def answer_to(sequence, answers, deadline):
-    """The answer that carries this request's stamp; answers to earlier requests are passed over."""
-    while True:
-        remaining = deadline - time.monotonic()
-        if remaining <= 0:
-            return None
-        try:
-            answer = answers.get(timeout=remaining)
-        except queue.Empty:
-            return None
-        if answer["header"]["stamp"]["secs"] == 1000 + sequence:
-            return answer
-
-
-def await_subscriber(client, topic):
-    """Waits until the detector listens: it subscribes only while somebody wants its answers."""
-    service = roslibpy.Service(client, "/rosapi/subscribers", "rosapi/Subscribers")
-    deadline = time.monotonic() + ANSWER_WITHIN
-    while time.monotonic() < deadline:
-        if service.call(roslibpy.ServiceRequest({"topic": topic}), timeout=10)["subscribers"]:
-            return
-        time.sleep(0.05)
-    sys.exit(f"nobody subscribed to {topic} within {ANSWER_WITHIN:.0f} s")
+def header(sequence):
+    """std_msgs/Header of ROS 1."""
+    return {"seq": sequence, "stamp": {"secs": stamp_seconds(sequence), "nsecs": 0}, "frame_id": "camera"}
 
 
 def main():
@@ -102,7 +62,8 @@ def main():
     drawn.subscribe(annotated.put)
     images = roslibpy.Topic(client, "/image", "sensor_msgs/Image")
     images.advertise()
-    await_subscriber(client, "/image")
+    # The detector subscribes only while somebody wants its answers.
+    await_subscriber(client, "/image", "rosapi/Subscribers")
 
     people = asked = answered = best = 0
     best_picture = None
@@ -110,8 +71,8 @@ def main():
     for sequence, (name, picture) in enumerate(frames(arguments.video, arguments.still, arguments.frames)):
         asked += 1
         sent = time.monotonic()
-        images.publish(image_message(picture, sequence))
-        answer = answer_to(sequence, answers, sent + ANSWER_WITHIN)
+        images.publish(image_message(picture, header(sequence)))
+        answer = answer_to(sequence, answers, sent + ANSWER_WITHIN, "secs")
         if answer is None:
             print(f"{name:>24}  no answer within {ANSWER_WITHIN:.0f} s", flush=True)
             continue
@@ -119,18 +80,13 @@ def main():
         rects = answer["rects"]
         people += len(rects)
         print(f"{name:>24}  {len(rects):>6}  {(time.monotonic() - sent) * 1000:>5.0f} ms", flush=True)
-        picture_back = answer_to(sequence, annotated, time.monotonic() + ANSWER_WITHIN)
+        picture_back = answer_to(sequence, annotated, time.monotonic() + ANSWER_WITHIN, "secs")
         if picture_back is not None and len(rects) > best:
             best, best_picture = len(rects), picture_back
     client.terminate()
 
     if arguments.picture and best_picture is not None:
-        data = numpy.frombuffer(base64.b64decode(best_picture["data"]), dtype=numpy.uint8)
-        data = data.reshape(best_picture["height"], best_picture["step"])
-        data = data[:, : best_picture["width"] * 3].reshape(best_picture["height"], best_picture["width"], 3)
-        if best_picture["encoding"] == "rgb8":
-            data = data[:, :, ::-1]
-        cv2.imwrite(arguments.picture, data)
+        cv2.imwrite(arguments.picture, picture_of(best_picture))
         print(f"wrote {arguments.picture}: the servant's picture with {best} people marked", flush=True)
     print(f"{answered} of {asked} frames answered, {people} people found", flush=True)
     sys.exit(0 if people > 0 and answered == asked else 1)
