@@ -45,6 +45,45 @@ pub enum Liveliness {
     ManualByTopic,
 }
 
+/// How samples are encoded (DDS-XTypes 1.3, 7.6.3.1.1). A writer writes in the first one of its own; a reader reads all of its own.
+/// ROS 2 writes XCDR1, and so do we.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Representations {
+    first: u8,
+    /// The bit of each number.
+    all: u8,
+}
+
+impl Representations {
+    /// XCDR1 alone, which holds for whoever says nothing.
+    pub const XCDR1: Self = Self { first: 0, all: 1 };
+    /// XCDR2 alone.
+    pub const XCDR2: Self = Self { first: 2, all: 4 };
+
+    /// By their numbers, the first of which a writer writes in; numbers beyond 7 stand for nothing that is known.
+    pub fn of(numbers: &[u16]) -> Self {
+        let Some(first) = numbers.first() else {
+            return Self::XCDR1;
+        };
+        let known = |number: &u16| u8::try_from(*number).ok().filter(|number| *number < 8);
+        let all = numbers.iter().filter_map(known);
+        Self {
+            first: known(first).unwrap_or(u8::MAX),
+            all: all.fold(0, |all, number| all | 1 << number),
+        }
+    }
+
+    /// The numbers of all, the first one first.
+    pub fn numbers(self) -> impl Iterator<Item = u16> {
+        let others = (0..8).filter(move |number| *number != self.first && self.reads(*number));
+        std::iter::once(self.first).chain(others).map(u16::from)
+    }
+
+    fn reads(self, number: u8) -> bool {
+        number < 8 && self.all & 1 << number != 0
+    }
+}
+
 /// What an end offers (a writer) or asks for (a reader).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct EndpointQos {
@@ -62,6 +101,8 @@ pub struct EndpointQos {
     pub liveliness: Liveliness,
     /// Within which time; none where that does not matter.
     pub lease: Option<Duration>,
+    /// How samples are encoded.
+    pub representations: Representations,
 }
 
 impl Default for EndpointQos {
@@ -74,6 +115,7 @@ impl Default for EndpointQos {
             lifespan: None,
             liveliness: Liveliness::Automatic,
             lease: None,
+            representations: Representations::XCDR1,
         }
     }
 }
@@ -146,7 +188,28 @@ impl EndpointQos {
             duration(self.lease),
             duration(requested.lease),
         );
+        let offered = self.representations;
+        check(
+            requested.representations.reads(offered.first),
+            "data representation",
+            name(u16::from(offered.first)),
+            requested
+                .representations
+                .numbers()
+                .map(name)
+                .collect::<Vec<_>>()
+                .join(" or "),
+        );
         found
+    }
+}
+
+fn name(representation: u16) -> String {
+    match representation {
+        0 => "XCDR1".to_owned(),
+        1 => "XML".to_owned(),
+        2 => "XCDR2".to_owned(),
+        other => format!("representation {other}"),
     }
 }
 
@@ -226,5 +289,27 @@ mod tests {
             ]
         );
         assert_eq!(requested.mismatches(&offered), []);
+    }
+    #[test]
+    fn a_reader_of_another_encoding_is_told_so() {
+        let reader = |numbers: &[u16]| EndpointQos {
+            representations: Representations::of(numbers),
+            ..EndpointQos::default()
+        };
+        let ours = EndpointQos::default();
+        for fits in [&[][..], &[0], &[2, 0], &[0, 1, 2]] {
+            assert_eq!(ours.mismatches(&reader(fits)), [], "{fits:?}");
+        }
+        let told: Vec<String> = ours
+            .mismatches(&reader(&[2, 1]))
+            .iter()
+            .map(Mismatch::to_string)
+            .collect();
+        let expected =
+            "data representation: the publisher offers XCDR1, the subscriber asks for XCDR2 or XML";
+        assert_eq!(told, [expected]);
+        // A writer writes in its first one only.
+        assert_eq!(reader(&[0, 2]).mismatches(&ours), []);
+        assert_eq!(reader(&[2, 0]).mismatches(&ours).len(), 1);
     }
 }

@@ -23,8 +23,12 @@ use crate::{EntityId, Guid, GuidPrefix, SampleIdentity};
 const HEARTBEAT: Duration = Duration::from_millis(100);
 /// A reader that has not shown yet that it knows this writer is asked so often; each time the pause doubles.
 const FIRST_HEARTBEAT: Duration = Duration::from_millis(10);
-/// Beyond this many bytes the oldest samples are given up, whatever the depth says; the newest one is always kept.
+/// Beyond this many bytes the oldest samples are given up, whatever the depth says, except the newest one and those that were begun.
 const MOST_BYTES: usize = 64 << 20;
+
+/// No further sample in fragments is begun to a reader that has so many bytes of them to acknowledge: it is repaired first, and what
+/// is replaced meanwhile was never begun.
+const WINDOW: usize = 8 << 20;
 
 /// A sample that is kept.
 #[derive(Debug, Clone)]
@@ -81,11 +85,20 @@ struct ReaderProxy {
     last_nack_frag: Option<u32>,
 }
 
+impl ReaderProxy {
+    /// Whether it has not acknowledged a sample that it is to acknowledge.
+    fn misses(&self, number: SequenceNumber) -> bool {
+        self.reliable && self.acknowledged < number && self.irrelevant < number
+    }
+}
+
 /// The state of one writer.
 #[derive(Debug)]
 pub(crate) struct WriterState {
     pub own: EndpointData,
     history: BTreeMap<SequenceNumber, Change>,
+    /// Samples of which reliable readers have been sent fragments.
+    begun: BTreeSet<SequenceNumber>,
     bytes: usize,
     last: SequenceNumber,
     proxies: Vec<ReaderProxy>,
@@ -99,6 +112,7 @@ impl WriterState {
         Self {
             own,
             history: BTreeMap::new(),
+            begun: BTreeSet::new(),
             bytes: 0,
             last: SequenceNumber(0),
             proxies: Vec::new(),
@@ -156,11 +170,7 @@ impl WriterState {
         self.bytes += change.payload.len();
         let length = change.payload.len();
         self.history.insert(number, change);
-        while self.history.len() > 1
-            && (self.history.len() > self.depth() || self.bytes > MOST_BYTES)
-        {
-            self.give_up_oldest();
-        }
+        self.trim();
         let mut told = BTreeSet::new();
         for proxy in &mut self.proxies {
             if proxy.reliable && proxy.ask_at.is_none() {
@@ -183,25 +193,64 @@ impl WriterState {
 
     /// Takes a sample back that is of no use to newcomers any more: an announcement that a later one replaces.
     pub fn forget(&mut self, number: SequenceNumber) {
+        self.begun.remove(&number);
         if let Some(change) = self.history.remove(&number) {
             self.bytes -= change.payload.len();
         }
     }
 
-    fn give_up_oldest(&mut self) {
-        let Some((number, change)) = self.history.pop_first() else {
-            return;
+    /// Fragments of a sample are sent to an address. It is kept beyond the depth until whoever is to acknowledge it there has: part
+    /// of it may be lost on the way, and a reader that is told that there is no more of it can come to a standstill (Fast DDS 2.14).
+    pub fn begun(&mut self, number: SequenceNumber, address: SocketAddr) {
+        if self.asks(address) && self.history.contains_key(&number) {
+            self.begun.insert(number);
+        }
+    }
+
+    pub fn is_begun(&self, number: SequenceNumber) -> bool {
+        self.begun.contains(&number)
+    }
+
+    /// Whether those at an address have as much to acknowledge as they may.
+    pub fn is_window_full(&self, address: SocketAddr) -> bool {
+        let missed = |number: &SequenceNumber| {
+            let mut there = self.proxies.iter().filter(|it| it.address == address);
+            there.any(|proxy| proxy.misses(*number))
         };
-        self.bytes -= change.payload.len();
-        let missed = |proxy: &ReaderProxy| {
-            proxy.reliable && proxy.acknowledged < number && proxy.irrelevant < number
+        let missed = self.begun.iter().filter(|number| missed(number));
+        let bytes = missed.filter_map(|number| self.history.get(number));
+        bytes.map(|change| change.payload.len()).sum::<usize>() >= WINDOW
+    }
+
+    /// Gives up what is beyond the depth, and beyond the memory.
+    fn trim(&mut self) {
+        while self.history.len() > self.depth().max(1) || self.bytes > MOST_BYTES {
+            let Some(number) = self.oldest_to_give_up() else {
+                break;
+            };
+            self.give_up(number);
+        }
+    }
+
+    fn oldest_to_give_up(&self) -> Option<SequenceNumber> {
+        let waits = |number: &SequenceNumber| {
+            let misses = |proxy: &ReaderProxy| proxy.misses(*number);
+            self.begun.contains(number) && self.proxies.iter().any(misses)
         };
-        self.dropped += u64::from(self.proxies.iter().any(missed));
+        let mut given_up = self.history.keys().filter(|number| !waits(number));
+        given_up.find(|number| **number != self.last).copied()
+    }
+
+    fn give_up(&mut self, number: SequenceNumber) {
+        let missed = self.proxies.iter().any(|proxy| proxy.misses(number));
+        self.dropped += u64::from(missed);
+        self.forget(number);
     }
 
     /// Lets go of what every reader has, unless newcomers are to be given it.
     fn let_go(&mut self) {
         if self.keeps_for_newcomers() {
+            self.trim();
             return;
         }
         let Some(least) = self

@@ -7,8 +7,8 @@ use super::{EndpointData, policies};
 use crate::wire::{ParameterWriter, WireError, list, list_header, parameter, pid};
 use crate::{EntityId, Guid};
 
-const KNOWN: [u16; 12] = {
-    let [a, b, c, d, e, f] = policies::KNOWN;
+const KNOWN: [u16; 13] = {
+    let [a, b, c, d, e, f, g] = policies::KNOWN;
     [
         pid::ENDPOINT_GUID,
         pid::TOPIC_NAME,
@@ -22,6 +22,7 @@ const KNOWN: [u16; 12] = {
         d,
         e,
         f,
+        g,
     ]
 };
 

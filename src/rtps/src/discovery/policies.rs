@@ -2,20 +2,24 @@
 
 use std::time::Duration;
 
-use crate::qos::{Durability, EndpointQos, History, Liveliness, Reliability};
+use crate::qos::{Durability, EndpointQos, History, Liveliness, Reliability, Representations};
 use crate::wire::{Input, ParameterWriter, WireError, pid};
 
 /// How long whoever writes may wait for room; nobody but its own writer uses it. DDS's default.
 const MAX_BLOCKING: Duration = Duration::from_millis(100);
 
+/// There are three.
+const MOST_REPRESENTATIONS: u32 = 8;
+
 /// Which parameters [`take`] takes.
-pub(super) const KNOWN: [u16; 6] = [
+pub(super) const KNOWN: [u16; 7] = [
     pid::RELIABILITY,
     pid::DURABILITY,
     pid::HISTORY,
     pid::DEADLINE,
     pid::LIFESPAN,
     pid::LIVELINESS,
+    pid::DATA_REPRESENTATION,
 ];
 
 /// What a writer or a reader has that says nothing.
@@ -32,6 +36,7 @@ pub(super) fn unsaid(is_writer: bool) -> EndpointQos {
         lifespan: None,
         liveliness: Liveliness::Automatic,
         lease: None,
+        representations: Representations::XCDR1,
     }
 }
 
@@ -63,6 +68,12 @@ pub(super) fn write(qos: &EndpointQos, list: &mut ParameterWriter) {
         Liveliness::ManualByTopic => 2,
     };
     list.kind_and_duration(pid::LIVELINESS, liveliness, qos.lease);
+    if qos.representations != Representations::XCDR1 {
+        let numbers: Vec<u16> = qos.representations.numbers().collect();
+        let mut value = (numbers.len() as u32).to_le_bytes().to_vec();
+        value.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
+        list.raw(pid::DATA_REPRESENTATION, &value);
+    }
 }
 
 /// Takes one of them.
@@ -102,6 +113,13 @@ pub(super) fn take(qos: &mut EndpointQos, number: u16, mut value: Input) -> Resu
                 _ => return Err(WireError::Value(number)),
             };
             qos.lease = value.duration()?.finite();
+        }
+        pid::DATA_REPRESENTATION => {
+            let mut numbers = Vec::new();
+            for _ in 0..value.u32()?.min(MOST_REPRESENTATIONS) {
+                numbers.push(value.u16()?);
+            }
+            qos.representations = Representations::of(&numbers);
         }
         _ => {}
     }

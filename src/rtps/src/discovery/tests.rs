@@ -7,7 +7,7 @@ use proptest::option;
 use proptest::prelude::*;
 
 use super::*;
-use crate::qos::{Durability, History, Liveliness, Reliability};
+use crate::qos::{Durability, History, Liveliness, Reliability, Representations};
 use crate::wire::properties::{guid, prefix};
 use crate::wire::tests::bytes;
 use crate::wire::{Data, InlineQos, ParticipantMessage, WireError};
@@ -98,10 +98,12 @@ fn qos() -> impl Strategy<Value = EndpointQos> {
         duration(),
         liveliness,
         duration(),
+        vec(0u16..3, 0..3),
     )
         .prop_map(
-            |(reliability, durability, history, deadline, lifespan, liveliness, lease)| {
+            |(reliability, durability, history, deadline, lifespan, liveliness, lease, numbers)| {
                 EndpointQos {
+                    representations: Representations::of(&numbers),
                     reliability,
                     durability,
                     history,
@@ -238,6 +240,7 @@ fn what_an_end_does_not_tell_is_as_dds_says() {
         lifespan: None,
         liveliness: Liveliness::Automatic,
         lease: None,
+        representations: Representations::XCDR1,
     };
     assert_eq!((reader.qos, reader.expects_inline_qos), (unsaid, false));
     let writer = EndpointData::from_payload(&list(&ENDPOINT.replace("00001207", "00001203")))

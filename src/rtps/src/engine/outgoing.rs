@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 
+use super::paths::Prepared;
 use super::{Datagram, Engine};
 use crate::reader::Answer;
 use crate::wire::{self, DatagramWriter, Submessage};
@@ -104,9 +105,13 @@ impl Engine {
             let Some(path) = self.paths.get_mut(&to) else {
                 continue;
             };
-            let Some(length) = path.prepare(&self.writers) else {
-                self.paths.remove(&to);
-                continue;
+            let length = match path.prepare(to, &self.writers) {
+                Prepared::Length(length) => length,
+                Prepared::Held => continue,
+                Prepared::Empty => {
+                    self.paths.remove(&to);
+                    continue;
+                }
             };
             if !room(to, length) {
                 continue;

@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use super::{Datagram, LocalWriter};
 use crate::fragments::{self, FRAGMENT};
 use crate::wire::{self, DataFragHead, DatagramWriter, InlineQos};
-use crate::writer::{Change, Item};
+use crate::writer::{Change, Item, WriterState};
 use crate::{EntityId, GuidPrefix, SequenceNumber};
 
 /// What the headers of a datagram with one fragment take, at most, in bytes.
@@ -19,6 +19,41 @@ struct Queue {
     /// What is being sent. It is kept until its last fragment is out, even where its writer has given it up: a receiver whose
     /// sender always begins anew would never have a whole sample.
     current: Option<(Item, Change)>,
+}
+
+impl Queue {
+    /// Takes the next sample, where its reader may be sent it now.
+    fn prepare(&mut self, to: SocketAddr, state: &WriterState) {
+        if self.current.is_some() {
+            return;
+        }
+        // What was given up meanwhile is passed over; who misses it is told when it asks.
+        self.waiting
+            .retain(|item| state.change(item.number).is_some());
+        // What was begun is repaired before anything else is begun.
+        let full = state.is_window_full(to);
+        let small = |item: &Item| item.last == 0 && item.reader != EntityId::UNKNOWN;
+        let next = self
+            .waiting
+            .iter()
+            .position(|item| !full || small(item) || state.is_begun(item.number));
+        let Some(item) = next.and_then(|at| self.waiting.remove(at)) else {
+            return;
+        };
+        let change = state.change(item.number);
+        self.current = change.map(|change| (item, change.clone()));
+    }
+}
+
+/// What is to be sent to one address next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Prepared {
+    /// A datagram of about so many bytes.
+    Length(usize),
+    /// Nothing until a reader has acknowledged something.
+    Held,
+    /// Nothing.
+    Empty,
 }
 
 /// What waits for one address.
@@ -71,26 +106,38 @@ impl Path {
         self.turns.retain(|turn| *turn != writer);
     }
 
-    /// Makes the next item ready; about how long its datagram will be. None where nothing waits.
-    pub fn prepare(&mut self, writers: &HashMap<EntityId, LocalWriter>) -> Option<usize> {
+    /// Makes the next item ready for this address.
+    pub fn prepare(
+        &mut self,
+        to: SocketAddr,
+        writers: &HashMap<EntityId, LocalWriter>,
+    ) -> Prepared {
+        let mut held = 0;
         while let Some(writer) = self.turns.front().copied() {
-            let queue = self.queues.get_mut(&writer)?;
-            while queue.current.is_none() {
-                let Some(item) = queue.waiting.pop_front() else {
-                    break;
-                };
-                // What was given up meanwhile is passed over; who misses it is told when it asks.
-                let change = writers
-                    .get(&writer)
-                    .and_then(|writer| writer.state.change(item.number));
-                queue.current = change.map(|change| (item, change.clone()));
+            if held == self.turns.len() {
+                return Prepared::Held;
+            }
+            let Some(queue) = self.queues.get_mut(&writer) else {
+                self.turns.pop_front();
+                continue;
+            };
+            if let Some(state) = writers.get(&writer).map(|writer| &writer.state) {
+                queue.prepare(to, state);
+            } else {
+                queue.waiting.clear();
             }
             match &queue.current {
-                Some((_, change)) => return Some(change.payload.len().min(FRAGMENT) + HEADERS),
-                None => self.forget(writer),
+                Some((_, change)) => {
+                    return Prepared::Length(change.payload.len().min(FRAGMENT) + HEADERS);
+                }
+                None if queue.waiting.is_empty() => self.forget(writer),
+                None => {
+                    held += 1;
+                    self.turns.rotate_left(1);
+                }
             }
         }
-        None
+        Prepared::Empty
     }
 
     /// The datagram of what was made ready. What has to follow it at once is put into `control`.
@@ -105,7 +152,10 @@ impl Path {
         self.turns.push_back(writer);
         let queue = self.queues.get_mut(&writer)?;
         let (mut item, change) = queue.current.take()?;
-        let state = writers.get_mut(&writer).map(|writer| &mut writer.state);
+        let mut state = writers.get_mut(&writer).map(|writer| &mut writer.state);
+        if let Some(state) = state.as_mut().filter(|_| item.last != 0) {
+            state.begun(item.number, to);
+        }
         // Whoever is to acknowledge is asked with the last part of each sample.
         let heartbeat = state
             .filter(|state| item.next == item.last && state.asks(to))

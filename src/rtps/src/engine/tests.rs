@@ -322,6 +322,43 @@ fn best_effort_samples_are_whole_or_lost_and_never_out_of_order() {
 }
 
 #[test]
+fn a_sample_of_which_parts_were_lost_is_whole_in_the_end_however_many_follow() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(1));
+    let (_, _, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    // One in three datagrams is lost, and each sample is replaced long before it is repaired.
+    let mut random = scattered(7);
+    world.loses = Box::new(move |_, _| random() % 3 == 0);
+    let fragmented = 20 * 16_000;
+    for mark in 1..=10 {
+        world.write(writer, mark, fragmented);
+        world.pass(Duration::from_millis(2));
+    }
+    world.loses = Box::new(|_, _| false);
+    world.pass(SECOND * 5);
+    assert_eq!(read.marks(), (1..=10).collect::<Vec<u8>>());
+    assert_eq!(world.engines[0].dropped(writer.entity), 0);
+}
+
+#[test]
+fn no_more_is_begun_to_a_reader_than_it_acknowledges() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(1));
+    let (_, _, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    // Whatever the reader says is lost for a while: the first two samples fill the window, and others replace each other behind.
+    world.loses = Box::new(|_, bytes| bytes.starts_with(b"RTPS") && bytes[8..20] == [2; 12]);
+    for mark in 1..=40 {
+        world.write(writer, mark, 5 << 20);
+        world.pass(Duration::from_millis(2));
+    }
+    world.loses = Box::new(|_, _| false);
+    world.pass(SECOND * 2);
+    assert_eq!(read.marks(), [1, 2, 40]);
+}
+
+#[test]
 fn newcomers_are_given_what_is_kept_for_them_and_nothing_else() {
     let mut world = World::of(2);
     let (kept, _) = world.writer(0, transient(2));

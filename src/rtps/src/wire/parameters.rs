@@ -36,6 +36,8 @@ pub(crate) mod pid {
     pub const ENTITY_NAME: u16 = 0x0062;
     pub const KEY_HASH: u16 = 0x0070;
     pub const STATUS_INFO: u16 = 0x0071;
+    /// DDS-XTypes 1.3 (7.6.3.1.1).
+    pub const DATA_REPRESENTATION: u16 = 0x0073;
     /// As DDS-RPC 1.0 has it (7.8.2).
     pub const RELATED_SAMPLE_IDENTITY: u16 = 0x0083;
     /// As Fast DDS had it before the standard; its versions of today write both and read either.
