@@ -41,8 +41,11 @@ pub enum Verdict {
 /// What kind of request it is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// A service call or an action's goal: exactly one result.
+    /// A service call: exactly one result.
     Call(Arc<str>),
+    /// A goal of an action: exactly one result. It may take long, and whoever has taken it carries it out while the way there
+    /// is lost.
+    Goal(Arc<str>),
     /// An input of the pair with this index.
     Input {
         pair: usize,
@@ -111,7 +114,7 @@ impl<P> Record<P> {
     }
 
     pub(crate) fn is_call(&self) -> bool {
-        matches!(self.kind, Kind::Call(_))
+        matches!(self.kind, Kind::Call(_) | Kind::Goal(_))
     }
 
     fn awaits_nobody(&self) -> bool {
@@ -155,7 +158,7 @@ impl<P: Clone> Arbiter<P> {
         let id = RequestId(self.next);
         self.next += 1;
         let outputs = match &kind {
-            Kind::Call(_) => 1,
+            Kind::Call(_) | Kind::Goal(_) => 1,
             Kind::Input { outputs, .. } => *outputs,
         };
         let deadline = now + t_max;

@@ -7,7 +7,7 @@ use crate::pair::{Correlation, Pair};
 pub struct Topic {
     /// Absolute name.
     pub name: String,
-    /// `package/Type`.
+    /// `package/Type`, of whichever ROS.
     pub type_name: String,
     /// The type begins with a `std_msgs/Header`.
     pub stamped: bool,
@@ -23,21 +23,26 @@ pub struct Found {
 }
 
 /// Topics that every node or many nodes have and that are nobody's request or answer.
-const HOUSEKEEPING: [&str; 8] = [
+const HOUSEKEEPING: [&str; 9] = [
     "/clock",
     "/tf",
     "/tf_static",
     "/rosout",
     "/rosout_agg",
+    "/parameter_events",
     "/diagnostics",
     "/statistics",
     "/initialpose",
 ];
-const HOUSEKEEPING_ENDINGS: [&str; 4] = [
+const HOUSEKEEPING_ENDINGS: [&str; 7] = [
     "/parameter_updates",
     "/parameter_descriptions",
     "/bond",
     "/camera_info",
+    "/transition_event",
+    // Of ROS 2's actions, whose goals and results are calls.
+    "/_action/feedback",
+    "/_action/status",
 ];
 /// Types that accompany data, configure or trigger nothing.
 const COMPANIONS: [&str; 7] = [
@@ -332,6 +337,24 @@ mod tests {
             pairs(&inputs, &outputs),
             ["/walk/goal -> /walk/result, /walk/feedback by goal"]
         );
+    }
+
+    #[test]
+    fn what_every_node_of_ros_2_has_answers_nothing() {
+        let inputs = [("/in", "std_msgs/String", false)];
+        let outputs = [
+            ("/a/_action/feedback", "p/Walk_FeedbackMessage", false),
+            ("/a/_action/status", "action_msgs/GoalStatusArray", false),
+            (
+                "/a/transition_event",
+                "lifecycle_msgs/TransitionEvent",
+                false,
+            ),
+            ("/out", "std_msgs/String", false),
+            ("/parameter_events", "rcl_interfaces/ParameterEvent", false),
+            ("/rosout", "rcl_interfaces/Log", false),
+        ];
+        assert_eq!(pairs(&inputs, &outputs), ["/in -> /out by arrival"]);
     }
 
     #[test]

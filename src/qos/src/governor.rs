@@ -145,11 +145,20 @@ impl<P: Clone> Governor<P> {
         }
     }
 
-    /// The application calls a service or sends a goal.
+    /// The application calls a service.
     pub fn call(&mut self, now: Instant, name: &Arc<str>, payload: P) -> RequestId {
+        self.open(now, name, Kind::Call(name.clone()), payload)
+    }
+
+    /// The application sends a goal of an action that is made of calls (ROS 2). Its result answers it.
+    pub fn goal(&mut self, now: Instant, action: &Arc<str>, payload: P) -> RequestId {
+        self.open(now, action, Kind::Goal(action.clone()), payload)
+    }
+
+    fn open(&mut self, now: Instant, name: &str, kind: Kind, payload: P) -> RequestId {
         self.tick(now);
         let t_max = self.sla.times(name).t_max;
-        let id = self.arbiter.call(now, t_max, name, payload);
+        let id = self.arbiter.open(now, t_max, kind, payload);
         self.asked(now, id);
         id
     }
@@ -210,14 +219,14 @@ impl<P: Clone> Governor<P> {
         }
     }
 
-    /// A side gave the result of a call.
+    /// A side gave the result of a call or a goal.
     #[must_use]
     pub fn answered(&mut self, now: Instant, side: Side, id: RequestId) -> Verdict {
         self.tick(now);
         self.completed(now, side, id, 0)
     }
 
-    /// A side cannot give the result of a call.
+    /// A side cannot give the result of a call or a goal.
     pub fn failed(&mut self, now: Instant, side: Side, id: RequestId, failure: &Failure) {
         self.tick(now);
         let Some(record) = self.arbiter.get(id) else {

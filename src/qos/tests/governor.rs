@@ -79,6 +79,11 @@ impl Robot {
         self.governor.call(self.now, &name, payload)
     }
 
+    fn goal(&mut self, payload: &'static str) -> RequestId {
+        let action: Arc<str> = "/walk".into();
+        self.governor.goal(self.now, &action, payload)
+    }
+
     fn image(&mut self, secs: u32, payload: &'static str) {
         let name: Arc<str> = "/image".into();
         self.governor.input(
@@ -751,4 +756,50 @@ fn without_a_promise_warm_and_first_sign_are_ready_before_they_are_needed() {
         assert_eq!(given_up[0], "stop feeding", "{local}");
         assert_eq!(given_up.len() == 1, begun, "{local}: {given_up:?}");
     }
+}
+
+#[test]
+fn a_goal_is_carried_out_while_the_link_is_away() {
+    let mut robot = Robot::new(json(r#"{"local": "none"}"#));
+    robot.effects();
+    let (goal, call) = (robot.goal("walk"), robot.call("add"));
+    assert_eq!(robot.effects(), ["walk to Cloud", "add to Cloud"]);
+    robot.governor.link_down(robot.now);
+    let said = robot.after(60_000);
+    assert_eq!(said.len(), 1, "the call alone is given up: {said:?}");
+    assert!(said[0].contains("the link is down"), "{said:?}");
+    robot.governor.link_up(robot.now, true);
+    let verdict = robot.governor.answered(robot.now, Side::Cloud, call);
+    assert_eq!(verdict, Verdict::Drop);
+    let verdict = robot.governor.answered(robot.now, Side::Cloud, goal);
+    assert_eq!(verdict, Verdict::Deliver);
+    // Another servant knows nothing of it.
+    robot.goal("run");
+    robot.governor.link_down(robot.now);
+    robot.effects();
+    robot.governor.link_up(robot.now, false);
+    assert_eq!(robot.effects(), ["run to Cloud"]);
+    // Nobody has taken this one.
+    robot.governor.link_down(robot.now);
+    robot.goal("jump");
+    let said = robot.after(1000);
+    assert!(
+        said.iter()
+            .any(|said| said.starts_with("fail: cloud: the link is down")),
+        "{said:?}"
+    );
+}
+
+#[test]
+fn a_goal_that_the_cloud_was_at_goes_on_at_the_local_original() {
+    let sla = r#"{"measure": {"link": {"after": 3}}, "local": "warm"}"#;
+    let mut robot = Robot::new(json(sla));
+    robot.governor.local(robot.now, LocalState::Ready);
+    let goal = robot.goal("walk");
+    assert!(!robot.after(60_000).contains(&"walk to Local".to_owned()));
+    robot.governor.link_down(robot.now);
+    let said = robot.after(60_000);
+    assert!(said.contains(&"walk to Local".to_owned()), "{said:?}");
+    let verdict = robot.governor.answered(robot.now, Side::Local, goal);
+    assert_eq!(verdict, Verdict::Deliver);
 }

@@ -78,7 +78,7 @@ impl<P: Clone> Governor<P> {
 
     pub(super) fn channel(&self, kind: &Kind) -> Channel {
         match kind {
-            Kind::Call(name) => Channel::Call(name.clone()),
+            Kind::Call(name) | Kind::Goal(name) => Channel::Call(name.clone()),
             Kind::Input { pair, .. } => Channel::Topic(self.pairs[*pair].input.clone()),
         }
     }

@@ -28,6 +28,8 @@ impl<P: Clone> Governor<P> {
         };
         let cloud = match &record.cloud {
             Leg::Failed(reason) => reason.clone(),
+            // It is being carried out there, and its result comes when the link is back.
+            Leg::Lost if matches!(record.kind, Kind::Goal(_)) => return,
             Leg::NotAsked | Leg::Lost if !self.link && record.overdue => {
                 format!(
                     "the link is down and was not up again within {:?}",

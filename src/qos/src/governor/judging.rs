@@ -76,7 +76,7 @@ impl<P: Clone> Governor<P> {
             return;
         };
         let times = match &record.kind {
-            Kind::Call(name) => self.sla.times(name),
+            Kind::Call(name) | Kind::Goal(name) => self.sla.times(name),
             Kind::Input { pair, .. } => self.sla.times(&self.pairs[*pair].input),
         };
         self.observe(t, times.t_desire, times.t_max);
