@@ -15,6 +15,8 @@ use tokio::task::JoinSet;
 
 use crate::network::Interface;
 
+pub use rtps::interfaces;
+
 /// A place in which TCP sockets can be opened: a servant's network namespace, or the host's own.
 #[async_trait]
 pub trait Sockets: Send + Sync + 'static {

@@ -17,8 +17,6 @@ pub struct Network {
     pub peers: Vec<SocketAddr>,
     /// Whether it has ports that others try without having been told of them.
     pub well_known: bool,
-    /// Discovery servers of Fast DDS. Where there are some, others are known by them alone.
-    pub servers: Vec<SocketAddr>,
 }
 
 impl Default for Network {
@@ -29,7 +27,6 @@ impl Default for Network {
             alone: false,
             peers: Vec::new(),
             well_known: false,
-            servers: Vec::new(),
         }
     }
 }

@@ -8,6 +8,7 @@ mod ends;
 mod entities;
 mod graph;
 mod interfaces;
+mod lending;
 pub mod lifecycle;
 pub mod names;
 mod node_ends;

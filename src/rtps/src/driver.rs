@@ -153,7 +153,8 @@ impl Shared {
         flow.take_wait();
         loop {
             let next = stalled.take().or_else(|| {
-                engine.transmit(&mut |to, length| flow.room(Instant::now(), to, length))
+                engine
+                    .transmit(&mut |to, length, again| flow.room(Instant::now(), to, length, again))
             });
             let Some(datagram) = next else {
                 return flow.take_wait().map_or(Waits::Nothing, Waits::Receivers);

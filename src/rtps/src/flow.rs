@@ -80,12 +80,13 @@ impl Flow {
         self.wait.take()
     }
 
-    /// Whether a receiver can take a datagram of so many bytes now; it is counted as sent if so.
-    pub fn room(&mut self, now: Instant, to: SocketAddr, length: usize) -> bool {
+    /// Whether a receiver can take a datagram of so many bytes now; it is counted as sent if so. `again` tells that it has
+    /// asked for it.
+    pub fn room(&mut self, now: Instant, to: SocketAddr, length: usize, again: bool) -> bool {
         let wait = match self.seen(to) {
             Some(at) if self.has_room(now, at, length) => return true,
             Some(_) => LOOK_AGAIN,
-            None => match self.pace.room(now, to, length) {
+            None => match self.pace.room(now, to, length, again) {
                 Ok(()) => return true,
                 Err(wait) => wait,
             },
@@ -266,7 +267,7 @@ mod tests {
         let mut flow = flow();
         let datagram = [7; 16_000];
         let mut sent = 0;
-        while flow.room(Instant::now(), to, datagram.len()) {
+        while flow.room(Instant::now(), to, datagram.len(), false) {
             sender.send_to(&datagram, to).expect("sending");
             sent += 1;
             assert!(sent < 10_000, "never refused");
@@ -281,7 +282,7 @@ mod tests {
             .count();
         assert_eq!(came, sent, "all that was sent has come");
         assert!(
-            flow.room(Instant::now(), to, datagram.len()),
+            flow.room(Instant::now(), to, datagram.len(), false),
             "there is room again"
         );
     }
@@ -293,12 +294,15 @@ mod tests {
         let to = receiver.local_addr().expect("its address");
         let (mut flow, mut now) = (flow(), Instant::now());
         let datagram = [7; 1000];
-        while flow.room(now, to, datagram.len()) {
+        while flow.room(now, to, datagram.len(), false) {
             sender.send_to(&datagram, to).expect("sending");
         }
         for _ in 0..100 {
             now += 2 * RECENT;
-            assert!(!flow.room(now, to, datagram.len()), "it is still full");
+            assert!(
+                !flow.room(now, to, datagram.len(), false),
+                "it is still full"
+            );
         }
     }
 
@@ -319,6 +323,6 @@ mod tests {
         let to = receiver.local_addr().expect("its address");
         drop(receiver);
         let mut flow = flow();
-        assert!((0..1000).all(|_| flow.room(Instant::now(), to, 16_000)));
+        assert!((0..1000).all(|_| flow.room(Instant::now(), to, 16_000, false)));
     }
 }

@@ -38,5 +38,7 @@ pub use network::{Interface, Interfaces, interfaces};
 pub use participant::{
     Config, Discovered, Ends, JoinError, Participant, Place, Reader, Sample, Sink, Topic, Writer,
 };
-pub use qos::{Durability, EndpointQos, History, Liveliness, Mismatch, Reliability, Representations};
+pub use qos::{
+    Durability, EndpointQos, History, Liveliness, Mismatch, Reliability, Representations,
+};
 pub use sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};

@@ -1,6 +1,7 @@
 //! How fast receivers are sent to whose buffers cannot be seen: those of other machines. Such a buffer holds some 200 kB by default,
 //! and what does not fit is lost without a word; a network is often quicker than whoever reads. So a large sample is spread over a
-//! part of the time until the next one, which is known by how much was sent lately: whoever can read what is sent can read it then.
+//! part of the time until the next one, which is known by how much was sent lately: whoever can read what is sent can read it then. A reliable receiver that asks for much
+//! again is sent to more slowly.
 
 #![forbid(unsafe_code)]
 
@@ -18,6 +19,13 @@ const LEAST: f64 = 50e6;
 const MOST: f64 = 1.25e9;
 /// Over which time it is averaged.
 const LATELY: f64 = 0.5;
+/// Where more than this part is sent again, the pace is too high.
+const LOST: f64 = 0.05;
+/// How often that is judged, by which factors the pace follows, and what part of it is left in the worst case.
+const JUDGED: Duration = Duration::from_millis(50);
+const SLOWER: f64 = 0.7;
+const FASTER: f64 = 1.1;
+const SLOWEST: f64 = 0.25;
 /// Receivers to which nothing was sent for so long are forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(10);
 
@@ -28,18 +36,38 @@ struct Bucket {
     tokens: f64,
     /// Bytes per second that were sent lately.
     sent: f64,
+    /// Those among them that had been lost before.
+    again: f64,
+    /// What part of the usual pace it keeps up with.
+    part: f64,
+    judged: Instant,
     counted: Instant,
 }
 
 impl Bucket {
     fn rate(&self) -> f64 {
-        (self.sent * AHEAD).clamp(LEAST, MOST)
+        (self.sent * AHEAD).clamp(LEAST, MOST) * self.part
+    }
+
+    /// Slows down while much is lost, and becomes faster again while little is.
+    fn judge(&mut self, now: Instant) {
+        if now.saturating_duration_since(self.judged) < JUDGED {
+            return;
+        }
+        self.judged = now;
+        let change = match self.again > self.sent * LOST {
+            true => SLOWER,
+            false => FASTER,
+        };
+        self.part = (self.part * change).clamp(SLOWEST, 1.0);
     }
 
     fn pass(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.counted).as_secs_f64();
         self.tokens = (self.tokens + passed * self.rate()).min(BURST);
         self.sent *= (-passed / LATELY).exp();
+        self.again *= (-passed / (LATELY / 5.0)).exp();
+        self.judge(now);
         self.counted = now;
     }
 }
@@ -51,11 +79,21 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// Whether a datagram of so many bytes may be sent now, and is counted as sent; else how long that takes.
-    pub fn room(&mut self, now: Instant, to: SocketAddr, length: usize) -> Result<(), Duration> {
+    /// Whether a datagram of so many bytes may be sent now, and is counted as sent; else how long that takes. `again` tells that the
+    /// receiver had asked for it.
+    pub fn room(
+        &mut self,
+        now: Instant,
+        to: SocketAddr,
+        length: usize,
+        again: bool,
+    ) -> Result<(), Duration> {
         let bucket = self.buckets.entry(to).or_insert(Bucket {
             tokens: BURST,
             sent: 0.0,
+            again: 0.0,
+            part: 1.0,
+            judged: now,
             counted: now,
         });
         bucket.pass(now);
@@ -63,7 +101,9 @@ impl Pace {
             return Err(Duration::from_secs_f64(-bucket.tokens / bucket.rate()));
         }
         bucket.tokens -= length as f64;
-        bucket.sent += length as f64 / LATELY;
+        let rate = length as f64 / LATELY;
+        bucket.sent += rate;
+        bucket.again += if again { rate } else { 0.0 };
         Ok(())
     }
 
@@ -84,7 +124,7 @@ mod tests {
     fn send(pace: &mut Pace, now: &mut Instant, bytes: usize) -> Duration {
         let begun = *now;
         for _ in 0..bytes.div_ceil(16_000) {
-            while let Err(wait) = pace.room(*now, TO.into(), 16_000) {
+            while let Err(wait) = pace.room(*now, TO.into(), 16_000, false) {
                 *now += wait.max(Duration::from_nanos(1));
             }
         }
@@ -125,9 +165,27 @@ mod tests {
     }
 
     #[test]
+    fn a_receiver_that_loses_much_is_sent_to_more_slowly_for_a_while() {
+        let (mut pace, mut now) = (Pace::default(), Instant::now());
+        let before = send(&mut pace, &mut now, 900_000);
+        for _ in 0..200 {
+            let _ = pace.room(now, TO.into(), 16_000, true);
+            now += Duration::from_millis(5);
+        }
+        let slow = send(&mut pace, &mut now, 900_000);
+        assert!(slow > before * 3, "{before:?}, then {slow:?}");
+        for _ in 0..1000 {
+            let _ = pace.room(now, TO.into(), 16_000, false);
+            now += Duration::from_millis(10);
+        }
+        let after = send(&mut pace, &mut now, 900_000);
+        assert!(after < before * 2, "{before:?}, then {after:?}");
+    }
+
+    #[test]
     fn receivers_are_forgotten() {
         let (mut pace, now) = (Pace::default(), Instant::now());
-        let _ = pace.room(now, TO.into(), 100);
+        let _ = pace.room(now, TO.into(), 100, false);
         pace.tidy(now + FORGOTTEN);
         assert!(pace.buckets.is_empty());
     }

@@ -69,8 +69,6 @@ pub struct Config {
     pub well_known: bool,
     /// Where to announce oneself beside: other participants' ports for discovery; those that the first 32 of a machine have, where the port is 0.
     pub peers: Vec<SocketAddr>,
-    /// Discovery servers of Fast DDS: where there are some, others are known by them alone.
-    pub servers: Vec<SocketAddr>,
 }
 
 impl Config {
@@ -88,7 +86,6 @@ impl Config {
             alone: false,
             well_known: false,
             peers: Vec::new(),
-            servers: Vec::new(),
         }
     }
 }
@@ -232,7 +229,6 @@ impl Participant {
         let flow = Flow::new(diagnostics);
         let own = own_data(&config, &network, &discovery, &user)?;
         let mut announce_to = peers(&config.peers, ports);
-        announce_to.extend(&config.servers);
         if multicast.is_some() {
             announce_to.push(SocketAddr::from((MULTICAST, ports.discovery_multicast())));
         }

@@ -20,7 +20,7 @@ use crate::qos::{Durability, Reliability};
 use crate::sequence::{FragmentNumber, SPAN, SequenceNumber, SequenceSet};
 use crate::time::WireTime;
 use crate::wire::{DataFrag, NackFrag};
-use crate::writer::newer;
+use crate::writer::Counts;
 use crate::{EntityId, Guid, GuidPrefix, VendorId, wire};
 
 /// A writer that has not told yet what it has is asked so often; each time the pause doubles, up to two seconds.
@@ -74,7 +74,7 @@ struct WriterProxy {
     assemblies: BTreeMap<SequenceNumber, Assembly>,
     /// The last number that the writer has told of.
     last: SequenceNumber,
-    last_heartbeat: Option<u32>,
+    heartbeats: Counts,
     acknacks: u32,
     nack_frags: u32,
     answer_at: Option<Instant>,
@@ -89,6 +89,8 @@ pub(crate) struct ReaderState {
     pub own: EndpointData,
     bounds: Bounds,
     proxies: Vec<WriterProxy>,
+    /// The most that was said to a writer that has gone.
+    counted: u32,
     /// Samples that were not taken: too long, or without room for them.
     pub refused: u64,
 }
@@ -99,6 +101,7 @@ impl ReaderState {
             own,
             bounds,
             proxies: Vec::new(),
+            counted: 0,
             refused: 0,
         }
     }
@@ -125,9 +128,10 @@ impl ReaderState {
             waiting: BTreeMap::new(),
             assemblies: BTreeMap::new(),
             last: SequenceNumber(0),
-            last_heartbeat: None,
-            acknacks: 0,
-            nack_frags: 0,
+            heartbeats: Counts::default(),
+            // A writer that is met anew need not know that.
+            acknacks: self.counted,
+            nack_frags: self.counted,
             answer_at: reliable.then_some(now),
             pause: FIRST_ASK,
             heard: false,
@@ -137,7 +141,14 @@ impl ReaderState {
     /// A writer has gone; whether it was matched.
     pub fn unmatched(&mut self, writer: Guid) -> bool {
         let before = self.proxies.len();
-        self.proxies.retain(|proxy| proxy.data.guid != writer);
+        let counted = &mut self.counted;
+        self.proxies.retain(|proxy| {
+            let stays = proxy.data.guid != writer;
+            if !stays {
+                *counted = (*counted).max(proxy.acknacks).max(proxy.nack_frags);
+            }
+            stays
+        });
         before != self.proxies.len()
     }
 
@@ -292,18 +303,13 @@ impl ReaderState {
         else {
             return false;
         };
-        if !proxy.reliable
-            || proxy
-                .last_heartbeat
-                .is_some_and(|before| !newer(beat.count, before))
-        {
-            return false;
-        }
         // A first number of 0 or less, or one beyond the last by more than one, is none (8.3.8.6.3).
-        if beat.first.0 < 1 || beat.last.0 < beat.first.0 - 1 {
+        if !proxy.reliable || beat.first.0 < 1 || beat.last.0 < beat.first.0 - 1 {
             return false;
         }
-        proxy.last_heartbeat = Some(beat.count);
+        if !proxy.heartbeats.takes(now, beat.count) {
+            return false;
+        }
         proxy.begin(beat.first, out);
         proxy.last = proxy.last.max(beat.last);
         proxy.skip_to(beat.first, out);

@@ -81,8 +81,8 @@ struct ReaderProxy {
     /// Asked when it has not answered or acknowledged until then.
     ask_at: Option<Instant>,
     pause: Duration,
-    last_acknack: Option<u32>,
-    last_nack_frag: Option<u32>,
+    acknacks: Counts,
+    nack_frags: Counts,
 }
 
 impl ReaderProxy {
@@ -295,8 +295,8 @@ impl WriterState {
             heard: false,
             ask_at: reliable.then_some(now + FIRST_HEARTBEAT),
             pause: FIRST_HEARTBEAT,
-            last_acknack: None,
-            last_nack_frag: None,
+            acknacks: Counts::default(),
+            nack_frags: Counts::default(),
         });
         if all {
             for (number, change) in &self.history {
@@ -349,14 +349,9 @@ impl WriterState {
         else {
             return false;
         };
-        if !proxy.reliable
-            || proxy
-                .last_acknack
-                .is_some_and(|before| !newer(count, before))
-        {
+        if !proxy.reliable || !proxy.acknacks.takes(now, count) {
             return false;
         }
-        proxy.last_acknack = Some(count);
         let known = std::mem::replace(&mut proxy.heard, true);
         let acknowledged = SequenceNumber(set.base.0.saturating_sub(1)).min(last);
         proxy.acknowledged = proxy.acknowledged.max(acknowledged);
@@ -400,6 +395,7 @@ impl WriterState {
     /// A reader misses fragments of a sample.
     pub fn nack_frag(
         &mut self,
+        now: Instant,
         reader: Guid,
         number: SequenceNumber,
         set: &FragmentSet,
@@ -413,14 +409,9 @@ impl WriterState {
         else {
             return;
         };
-        if !proxy.reliable
-            || proxy
-                .last_nack_frag
-                .is_some_and(|before| !newer(count, before))
-        {
+        if !proxy.reliable || !proxy.nack_frags.takes(now, count) {
             return;
         }
-        proxy.last_nack_frag = Some(count);
         let Some(change) = self.history.get(&number) else {
             wanted.gaps.push((
                 proxy.address,
@@ -528,7 +519,29 @@ fn item(
     }
 }
 
+/// The counts of what another end says again and again (8.3.8.1, 8.3.8.6): what comes twice, or late, is told by them.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Counts {
+    last: Option<(u32, Instant)>,
+}
+
+/// Nothing is so late. Whoever has heard nothing of us for the time of its lease meets us anew, and counts anew.
+const TOO_LATE: Duration = Duration::from_secs(3);
+
+impl Counts {
+    /// Whether what has this count is to be heeded.
+    pub fn takes(&mut self, now: Instant, count: u32) -> bool {
+        let heeded = self.last.is_none_or(|(before, at)| {
+            newer(count, before) || now.saturating_duration_since(at) > TOO_LATE
+        });
+        if heeded {
+            self.last = Some((count, now));
+        }
+        heeded
+    }
+}
+
 /// Whether a count comes after another one, though counts begin anew.
-pub(crate) fn newer(count: u32, before: u32) -> bool {
+fn newer(count: u32, before: u32) -> bool {
     count.wrapping_sub(before).wrapping_sub(1) < u32::MAX / 2
 }

@@ -38,6 +38,7 @@ use super::actions::Retired;
 use super::calls::Clients;
 use super::ends::Own;
 use super::entities::{self, GidSize, Told};
+use super::lending::Loans;
 use super::place::Place;
 use super::publications::Adverts;
 use super::raw::Hub;
@@ -48,8 +49,9 @@ use super::watcher::Watcher;
 use super::{actions, calls, names, publications, services, subscriptions, topic_type};
 use crate::JoinOptions;
 use crate::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, NodeParameters,
-    Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription, WireFormat, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending,
+    NodeParameters, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
+    WireFormat, WireType,
 };
 use crate::net::Sockets;
 use crate::schema::ActionDef;
@@ -61,7 +63,7 @@ const FAREWELL: Duration = Duration::from_secs(2);
 
 /// A ROS 2 system as a [`Bus`]. Dropping it ends all that goes on, as [`Bus::close`] does, without waiting.
 pub struct Ros2Bus {
-    inner: Arc<Inner>,
+    pub(super) inner: Arc<Inner>,
 }
 
 /// What all parts of a bus share.
@@ -81,6 +83,8 @@ pub(super) struct Inner {
     pub(super) adverts: Mutex<Adverts>,
     pub(super) clients: Clients,
     pub(super) services: Mutex<HashMap<String, Arc<Served>>>,
+    /// What another system lends to the nodes of this one.
+    pub(super) loans: Loans,
     /// Of servers of actions that are gone.
     pub(super) retired: Retired,
     /// Changes with the services that are served here.
@@ -108,7 +112,6 @@ impl Ros2Bus {
             alone: network.alone,
             peers: network.peers,
             well_known: network.well_known,
-            servers: network.servers,
             user_data: Bytes::from_static(USER_DATA),
             max_sample: options.max_message,
             budget: options.budget,
@@ -134,6 +137,7 @@ impl Ros2Bus {
             adverts: Mutex::default(),
             clients: Clients::default(),
             services: Mutex::default(),
+            loans: Loans::default(),
             retired: Retired::default(),
             served: watch::Sender::default(),
             listening: Mutex::new(Some(listening)),
@@ -348,6 +352,10 @@ impl Bus for Ros2Bus {
     }
 
     fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        Ok(self)
+    }
+
+    fn lending(&self) -> Result<&dyn Lending, BusError> {
         Ok(self)
     }
 

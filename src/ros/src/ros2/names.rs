@@ -62,7 +62,7 @@ pub(super) fn named(topic: &str) -> Option<Named> {
 }
 
 /// The action, and which part of it has this name: `/fib` and `send_goal`.
-pub(super) fn action_part(name: &str) -> Option<(&str, &str)> {
+pub fn action_part(name: &str) -> Option<(&str, &str)> {
     let (action, part) = name.rsplit_once(ACTION)?;
     (!action.is_empty() && !is_hidden(action)).then_some((action, part))
 }

@@ -81,7 +81,7 @@ fn flatten(name: &str, value: &ParamValue, into: &mut BTreeMap<String, String>) 
 
 /// As the parser of `-p` reads it (YAML). What ROS 2 has no such parameter for (lists of several types, or of lists) is
 /// written all the same: the node then ends, and says why.
-fn yaml(value: &ParamValue) -> String {
+pub fn yaml(value: &ParamValue) -> String {
     match value {
         ParamValue::Bool(value) => value.to_string(),
         ParamValue::Int(value) => value.to_string(),

@@ -38,6 +38,8 @@ pub(super) fn qos() -> EndpointQos {
 pub(super) struct Served {
     pub(super) of: ServiceType,
     pub(super) handler: Arc<dyn ServiceHandler>,
+    /// It is another system's, and gives way to who serves it here.
+    pub(super) lent: bool,
 }
 
 /// What serves a service here.
@@ -52,11 +54,34 @@ pub(super) fn serve(
     of: ServiceType,
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
-    let (request, reply) = (names::request(service, &of)?, names::reply(service, &of)?);
-    let served = Arc::new(Served { of, handler });
+    let lent = false;
+    begin(bus, service, Served { of, handler, lent })
+}
+
+/// Serves a service of another system, unless it is served here.
+pub(super) fn lend(
+    bus: &Arc<Inner>,
+    service: &str,
+    of: ServiceType,
+    handler: Arc<dyn ServiceHandler>,
+) -> Result<Box<dyn Send + Sync>, BusError> {
+    let lent = true;
+    begin(bus, service, Served { of, handler, lent })
+}
+
+fn begin(
+    bus: &Arc<Inner>,
+    service: &str,
+    served: Served,
+) -> Result<Box<dyn Send + Sync>, BusError> {
+    let of = &served.of;
+    let request = bus.loans.labelled(names::request(service, of)?);
+    let reply = names::reply(service, of)?;
+    let served = Arc::new(served);
     {
         let mut services = bus.services.lock();
-        if services.contains_key(service) {
+        let known = services.get(service);
+        if known.is_some_and(|known| served.lent || !known.lent) {
             return Err(BusError::AlreadyServed(service.to_owned()));
         }
         services.insert(service.to_owned(), Arc::clone(&served));

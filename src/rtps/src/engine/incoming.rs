@@ -124,9 +124,14 @@ impl Engine {
                 let mut wanted = Wanted::default();
                 let reader = Guid::new(from, nack.reader);
                 if let Some(writer) = self.writers.get_mut(&nack.writer) {
-                    writer
-                        .state
-                        .nack_frag(reader, nack.number, &nack.set, nack.count, &mut wanted);
+                    writer.state.nack_frag(
+                        now,
+                        reader,
+                        nack.number,
+                        &nack.set,
+                        nack.count,
+                        &mut wanted,
+                    );
                     self.enqueue(nack.writer, wanted);
                 }
             }

@@ -79,10 +79,11 @@ impl Engine {
     }
 
     /// The next datagram to send; none where there is none, or where all that there are have to wait until their receivers
-    /// have room. `room` tells whether there is some for a datagram of so many bytes.
+    /// have room. `room` tells whether there is some for a datagram of so many bytes, which its receiver has asked
+    /// for or not.
     pub fn transmit(
         &mut self,
-        room: &mut dyn FnMut(SocketAddr, usize) -> bool,
+        room: &mut dyn FnMut(SocketAddr, usize, bool) -> bool,
     ) -> Option<Datagram> {
         if let Some(datagram) = self.control.pop_front() {
             return Some(datagram);
@@ -105,15 +106,15 @@ impl Engine {
             let Some(path) = self.paths.get_mut(&to) else {
                 continue;
             };
-            let length = match path.prepare(to, &self.writers) {
-                Prepared::Length(length) => length,
+            let (length, again) = match path.prepare(to, &self.writers) {
+                Prepared::Length(length, again) => (length, again),
                 Prepared::Held => continue,
                 Prepared::Empty => {
                     self.paths.remove(&to);
                     continue;
                 }
             };
-            if !room(to, length) {
+            if !room(to, length, again) {
                 continue;
             }
             self.next_path = Some(to);

@@ -48,8 +48,8 @@ impl Queue {
 /// What is to be sent to one address next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Prepared {
-    /// A datagram of about so many bytes.
-    Length(usize),
+    /// A datagram of about so many bytes, and whether a reader has asked for it.
+    Length(usize, bool),
     /// Nothing until a reader has acknowledged something.
     Held,
     /// Nothing.
@@ -127,8 +127,9 @@ impl Path {
                 queue.waiting.clear();
             }
             match &queue.current {
-                Some((_, change)) => {
-                    return Prepared::Length(change.payload.len().min(FRAGMENT) + HEADERS);
+                Some((item, change)) => {
+                    let length = change.payload.len().min(FRAGMENT) + HEADERS;
+                    return Prepared::Length(length, item.reader != EntityId::UNKNOWN);
                 }
                 None if queue.waiting.is_empty() => self.forget(writer),
                 None => {

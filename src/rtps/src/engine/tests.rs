@@ -119,7 +119,7 @@ impl World {
         for index in 0..self.engines.len() {
             let mut left = self.room.unwrap_or(usize::MAX);
             let mut out = Vec::new();
-            while let Some(datagram) = self.engines[index].transmit(&mut |_, length| {
+            while let Some(datagram) = self.engines[index].transmit(&mut |_, length, _| {
                 let fits = left >= length;
                 left -= if fits { length } else { 0 };
                 fits
@@ -356,6 +356,27 @@ fn no_more_is_begun_to_a_reader_than_it_acknowledges() {
     world.loses = Box::new(|_, _| false);
     world.pass(SECOND * 2);
     assert_eq!(read.marks(), [1, 2, 40]);
+}
+
+#[test]
+fn whoever_was_given_up_by_one_side_alone_is_met_again_by_both() {
+    for forgets in [0, 1] {
+        let mut world = World::of(2);
+        let (writer, _) = world.writer(0, keep(10));
+        let (reader, reader_ends, read) = world.reader(1, keep(10));
+        world.pass(SECOND * 5);
+        world.write(writer, 1, 8);
+        world.pass(SECOND);
+        // As after a pause of the network that was longer than one lease and shorter than the other.
+        let other = [reader.prefix, writer.prefix][forgets];
+        world.engines[forgets].participant_gone(other);
+        world.engines[forgets].settle();
+        world.pass(SECOND * 9);
+        world.write(writer, 2, 100_000);
+        world.pass(SECOND);
+        assert_eq!(read.marks(), [1, 2], "{forgets} forgets");
+        assert_eq!(reader_ends.borrow().confirmed, [writer]);
+    }
 }
 
 #[test]
@@ -596,7 +617,7 @@ fn datagrams_of_nonsense_change_nothing() {
     let mut kept: Vec<Bytes> = Vec::new();
     for mark in 0..4 {
         world.write(writer, mark, 40_000);
-        while let Some(datagram) = world.engines[0].transmit(&mut |_, _| true) {
+        while let Some(datagram) = world.engines[0].transmit(&mut |_, _, _| true) {
             kept.push(
                 datagram
                     .parts()
