@@ -28,7 +28,9 @@ use std::time::Duration;
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, Qos, Subscription, TopicNodes, WireType};
+use ros::bus::{Bus, Graph, Qos, RosVersion, Subscription, TopicNodes, WireType};
+use ros::plumbing;
+use ros::ros2::lifecycle::{self, Begun, NotBegun};
 use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -50,7 +52,7 @@ pub enum ProbeError {
     Exited(String),
     /// A node did not show up.
     #[error(
-        "{} did not register with the ROS Master within {after:?}: it may wait for something that is not there{} (see \
+        "{} did not register with ROS within {after:?}: it may wait for something that is not there{} (see \
          its log); a parameter (--param) or an argument (--arg) may help",
         nodes.join(", "), services(sought)
     )]
@@ -86,8 +88,11 @@ pub enum ProbeError {
         problem: ros::schema::SchemaError,
     },
     /// The graph could not be watched any longer.
-    #[error("the servant's ROS Master went away while its interface was looked at")]
+    #[error("the servant's ROS went away while its interface was looked at")]
     MasterGone,
+    /// A node with a lifecycle does not begin its work.
+    #[error(transparent)]
+    Lifecycle(#[from] NotBegun),
 }
 
 fn services(sought: &[String]) -> String {
@@ -102,6 +107,8 @@ fn services(sought: &[String]) -> String {
 pub struct ProbeOptions {
     /// Nodes that must register.
     pub nodes: Vec<String>,
+    /// Which ROS it is; the bus knows.
+    pub ros: RosVersion,
     /// Name of the looking node, which is no part of what it sees.
     pub own_name: String,
     /// At most so long for nodes to register.
@@ -152,6 +159,7 @@ impl ProbeOptions {
     pub fn new(nodes: Vec<String>, own_name: &str) -> Self {
         Self {
             nodes,
+            ros: RosVersion::One,
             own_name: own_name.to_owned(),
             patience: Duration::from_secs(60),
             settle: Duration::from_millis(700),
@@ -182,7 +190,7 @@ pub struct Found {
 
 /// Looks. `exited` resolves when a node ends that should not, with what is to be said about it.
 pub async fn probe(
-    bus: &dyn Bus,
+    bus: &Arc<dyn Bus>,
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
     options: &ProbeOptions,
@@ -201,15 +209,21 @@ pub async fn probe(
 }
 
 async fn look(
-    bus: &dyn Bus,
+    bus: &Arc<dyn Bus>,
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
     options: &ProbeOptions,
     unfed: &Mutex<Option<Found>>,
 ) -> Result<Found, ProbeError> {
+    let options = &ProbeOptions {
+        ros: bus.version(),
+        ..options.clone()
+    };
     let mut watch = bus.graph();
     settle::registered(&mut watch, options).await?;
     tracing::debug!("probe: all nodes are registered");
+    let idle = begin_lifecycles(bus, &mut watch, options).await?;
+    let bus = &**bus;
     let mut feed = Feed::begin(bus, registry, options).await;
     let mut look = Look {
         bus,
@@ -265,10 +279,34 @@ async fn look(
         *unfed.lock() = Some(found.clone());
     }
     incomplete::warn(&mut found, options, &mut feed);
+    found.warnings.extend(idle);
     found.warnings.splice(..0, look.warnings);
     let grown = look.lengths.into_iter().filter(|(_, of)| of.is_growth());
     found.growing = grown.map(|(topic, _)| topic).collect();
     Ok(found)
+}
+
+/// Has nodes configure and activate themselves that nobody else drives: before that they show nothing. What is to be said
+/// of those that are left as they are.
+async fn begin_lifecycles(
+    bus: &Arc<dyn Bus>,
+    watch: &mut watch::Receiver<Arc<Graph>>,
+    options: &ProbeOptions,
+) -> Result<Vec<String>, ProbeError> {
+    if bus.version() == RosVersion::One {
+        return Ok(Vec::new());
+    }
+    // Services of a node are seen a moment after the node itself.
+    settle::still(watch, options).await?;
+    let begun = lifecycle::begin_all(bus, options.patience).await?;
+    let left = begun.into_iter().filter_map(|(node, begun)| match begun {
+        Begun::Left(state) if state != lifecycle::State::Active => Some(format!(
+            "the lifecycle node {node} was {state} when it was looked at: something else drives it, and what it shows \
+             later may be missing"
+        )),
+        _ => None,
+    });
+    Ok(left.collect())
 }
 
 /// One look at a running package.
@@ -376,12 +414,6 @@ impl Look<'_> {
     }
 }
 
-/// ROS's own plumbing, which no robot asks for: logs, statistics, simulated time, the life lines of nodelets.
-fn is_plumbing(name: &str, topic: &TopicNodes) -> bool {
-    matches!(name, "/rosout" | "/rosout_agg" | "/statistics" | "/clock")
-        || topic.type_name == "bond/Status"
-}
-
 /// Topics that the package publishes.
 fn outputs(graph: &Graph, own: &str) -> BTreeSet<String> {
     ends(graph, |topic| {
@@ -400,7 +432,7 @@ fn ends(graph: &Graph, pick: impl Fn(&TopicNodes) -> bool) -> BTreeSet<String> {
     let topics = graph
         .topics
         .iter()
-        .filter(|(name, topic)| !is_plumbing(name, topic) && pick(topic));
+        .filter(|(name, topic)| !plumbing::topic(graph, name) && pick(topic));
     topics.map(|(name, _)| name.clone()).collect()
 }
 

@@ -4,9 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use package::interface::{Action, Direction, Interface, Need, Parameter, Service, Topic};
-use ros::bus::{Bus, BusError, Graph, ParamValue, WireType};
-use ros::ros1::own_parameters::every_node_asks_for;
+use package::interface::{Action, Direction, Interface, Need, Parameter, Qos, Service, Topic};
+use package::names;
+use ros::bus::{
+    Bus, BusError, Digest, Graph, NodeEnds, ParamValue, RosVersion, ServiceType, WireFormat,
+    WireType,
+};
+use ros::plumbing;
+use ros::ros2::lifecycle::LifecycleNode;
 use ros::schema::{Base, MessageType, Registry};
 
 use super::{Found, ProbeError, ProbeOptions, inputs, outputs, settle};
@@ -73,7 +78,7 @@ pub(super) async fn describe(
         .iter()
         .filter(|(_, node)| **node != seen.options.own_name)
     {
-        if name.ends_with("/get_loggers") || name.ends_with("/set_logger_level") {
+        if plumbing::service(seen.options.ros, graph, name) {
             continue;
         }
         match ask(name, seen, bus.service_type(name)).await {
@@ -85,30 +90,40 @@ pub(super) async fn describe(
                             what: format!("service {name}"),
                             problem,
                         })?;
-                compare(
-                    &format!("service {name}"),
-                    &wire.name,
-                    wire.digest.as_str(),
-                    &service.md5,
-                )?;
+                let defined = ServiceType::of(&service);
+                if !wire.agrees(&defined) {
+                    let (announced, defined) = differing(&wire, &defined);
+                    return Err(mismatch(
+                        &format!("service {name}"),
+                        &wire.name,
+                        &announced,
+                        &defined,
+                    ));
+                }
                 texts.service(&wire.name, [&service.request, &service.response]);
                 services.push(Service {
                     name: name.clone(),
                     type_name: wire.name,
-                    md5: wire.digest.to_string(),
+                    // Nodes of ROS 2 may tell those of its parts alone.
+                    md5: service.md5.clone(),
                     node: node.clone(),
                 });
             }
             Err(problem) => found.warnings.push(problem),
         }
     }
-    let parameters = parameters(bus, graph, &seen.options.own_name).await;
+    let mut parameters = parameters(bus, graph, &seen.options.own_name).await;
+    own_parameters(bus, seen, &mut parameters, &mut found.warnings).await;
+    let lifecycle = LifecycleNode::all(graph).into_iter();
     found.interface = Interface {
         topics,
         services,
         actions,
         parameters,
         needs: needs_of(seen),
+        lifecycle: lifecycle
+            .filter(|node| *node != seen.options.own_name)
+            .collect(),
         late: Vec::new(),
         definitions: texts.used,
     };
@@ -140,7 +155,8 @@ pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
 fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
     let mut needs = needs(&seen.graph, &seen.options.own_name);
     for (name, nodes) in &seen.asked {
-        if seen.graph.services.contains_key(name) {
+        let server = seen.graph.services.get(name);
+        if server.is_some_and(|node| *node != seen.options.own_name) {
             continue;
         }
         match needs.iter_mut().find(|need| need.name == *name) {
@@ -198,8 +214,9 @@ fn topic(
     texts: &mut Texts<'_>,
 ) -> Result<Topic, ProbeError> {
     // Some nodes take any type; nothing is to be compared.
-    let any = wire.name == "*" || wire.digest.is_any();
-    if !any {
+    let untold = wire.format == WireFormat::Ros1 && wire.digest.is_any();
+    let mut md5 = wire.digest.to_string();
+    if wire.name != "*" && !untold {
         let message = match registry.message(&wire.name) {
             Ok(message) => message,
             // No definition in the image, but the publisher sent its own.
@@ -226,39 +243,80 @@ fn topic(
             message.md5(),
         )?;
         texts.message(&message);
+        // Before Iron nodes of ROS 2 tell no digests.
+        md5 = message.digest().to_owned();
     }
     let ends = seen.graph.topics.get(&name);
     let nodes = match direction {
         Direction::Input => ends.map(|topic| &topic.subscribers),
         Direction::Output => ends.map(|topic| &topic.publishers),
     };
-    let nodes = nodes
+    let nodes: Vec<String> = nodes
         .into_iter()
         .flatten()
         .filter(|node| **node != seen.options.own_name)
         .cloned()
         .collect();
+    let qos = qos(&seen.graph, &name, direction, &nodes);
+    let keeps = qos.is_some_and(|qos| qos.on_bus(1).is_latching());
     Ok(Topic {
-        latched: direction == Direction::Output && seen.latched.contains(&name),
+        latched: direction == Direction::Output && (keeps || seen.latched.contains(&name)),
+        qos,
         lazy: direction == Direction::Input && !seen.eager.contains(&name),
         type_name: wire.name,
-        md5: wire.digest.to_string(),
+        md5,
         direction,
         nodes,
         name,
     })
 }
 
+/// What these nodes offer or ask for together, where ends tell it.
+fn qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[String]) -> Option<Qos> {
+    let ends = nodes.iter().filter_map(|node| {
+        let NodeEnds {
+            publishers,
+            subscribers,
+            ..
+        } = graph.ends.get(node)?;
+        let ends = match direction {
+            Direction::Output => publishers,
+            Direction::Input => subscribers,
+        };
+        ends.get(topic).map(|(_, qos)| Qos::from(qos))
+    });
+    ends.reduce(|all, one| match direction {
+        Direction::Output => all.least(one),
+        Direction::Input => all.most(one),
+    })
+}
+
+/// Of what both tell: that in which they differ.
+fn differing(announced: &ServiceType, defined: &ServiceType) -> (String, String) {
+    let parts = [
+        (&announced.digest, &defined.digest),
+        (&announced.request, &defined.request),
+        (&announced.response, &defined.response),
+    ];
+    let pair = parts.into_iter().find(|(one, other)| !one.agrees(other));
+    let (one, other) = pair.unwrap_or(parts[0]);
+    (Digest::to_string(one), Digest::to_string(other))
+}
+
 fn compare(what: &str, type_name: &str, announced: &str, defined: &str) -> Result<(), ProbeError> {
     if announced == "*" || announced == defined {
         return Ok(());
     }
-    Err(ProbeError::Mismatch {
+    Err(mismatch(what, type_name, announced, defined))
+}
+
+fn mismatch(what: &str, type_name: &str, announced: &str, defined: &str) -> ProbeError {
+    ProbeError::Mismatch {
         what: what.to_owned(),
         type_name: type_name.to_owned(),
         announced: announced.to_owned(),
         defined: defined.to_owned(),
-    })
+    }
 }
 
 /// Actions that the package serves; topics that they are made of are no part of the interface.
@@ -290,7 +348,10 @@ fn take_actions(
                     goal.md5(),
                 )?;
             }
-            texts.action(&ends.type_name);
+            texts.action(
+                &ends.type_name,
+                [&action.goal, &action.result, &action.feedback],
+            );
         }
         // In either direction: a server may well be its own client (move_base is).
         topics.retain(|topic| !ends.topics.contains(&topic.name));
@@ -310,8 +371,7 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
             nodes.iter().filter(|node| *node != own).cloned().collect()
         };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
-        let plumbing = every_node_asks_for(name);
-        if plumbing || (read_by.is_empty() && written_by.is_empty()) {
+        if plumbing::parameter(name) || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
         let value = bus.parameter(name).await.ok().map(|value| json(&value));
@@ -320,9 +380,59 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
             value,
             read_by,
             written_by,
+            ..Parameter::default()
         });
     }
     parameters
+}
+
+/// Adds parameters that nodes have of their own, with what they say of them.
+async fn own_parameters(
+    bus: &dyn Bus,
+    seen: &Seen<'_>,
+    all: &mut Vec<Parameter>,
+    warnings: &mut Vec<String>,
+) {
+    let (graph, own_name) = (&*seen.graph, &seen.options.own_name);
+    if seen.options.ros == RosVersion::One {
+        return;
+    }
+    let nodes = graph.nodes.keys().filter(|node| {
+        let list = graph.services.get(&format!("{node}/list_parameters"));
+        list == Some(*node) && *node != own_name
+    });
+    for node in nodes {
+        match settle::answered(ANSWER, seen.options, parameters_of(bus, node)).await {
+            Some(Ok(parameters)) => all.extend(parameters),
+            Some(Err(error)) => {
+                warnings.push(format!("{node} does not tell its parameters: {error}"));
+            }
+            None => warnings.push(format!(
+                "{node} does not tell its parameters within {ANSWER:?}"
+            )),
+        }
+    }
+}
+
+async fn parameters_of(bus: &dyn Bus, node: &str) -> Result<Vec<Parameter>, BusError> {
+    let parameters = bus.node_parameters()?;
+    let mut names = parameters.list(node, &[], 0).await?.names;
+    names.retain(|name| !plumbing::parameter(name));
+    names.sort();
+    let descriptions = match names.is_empty() {
+        true => return Ok(Vec::new()),
+        false => parameters.describe(node, &names).await?,
+    };
+    let values = parameters.get(node, &names).await?;
+    let told = names.into_iter().zip(descriptions).zip(values);
+    let parameter = |((name, description), value)| Parameter {
+        name: format!("{node}/{name}"),
+        node: node.to_owned(),
+        value: Option::map(value, |value| json(&value)),
+        descriptor: Option::map(description, Into::into),
+        ..Parameter::default()
+    };
+    Ok(told.map(parameter).collect())
 }
 
 fn json(value: &ParamValue) -> serde_json::Value {
@@ -337,7 +447,7 @@ struct Texts<'a> {
 
 impl Texts<'_> {
     fn message(&mut self, message: &Arc<MessageType>) {
-        let key = message.name().replacen('/', "/msg/", 1);
+        let key = names::key(message.name(), "msg");
         // Requests, goals and the like have no text of their own: the service's or the action's is theirs.
         let text = self
             .definitions
@@ -362,12 +472,13 @@ impl Texts<'_> {
         halves.into_iter().for_each(|half| self.fields(half));
     }
 
-    fn action(&mut self, name: &str) {
+    fn action(&mut self, name: &str, parts: [&Arc<MessageType>; 3]) {
         self.copy(name, "action");
+        parts.into_iter().for_each(|part| self.fields(part));
     }
 
     fn copy(&mut self, name: &str, kind: &str) {
-        let key = name.replacen('/', &format!("/{kind}/"), 1);
+        let key = names::key(name, kind);
         if let Some(text) = self.definitions.get(&key) {
             self.used.insert(key, text.clone());
         }

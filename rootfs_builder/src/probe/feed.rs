@@ -15,15 +15,18 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, ParamValue, Publisher, Qos, Subscription, WireType, reaches};
+use ros::bus::{
+    Bus, Graph, ParamValue, Publisher, Qos, RosVersion, Subscription, WireType, reaches,
+};
 use ros::codec::{self, FillOptions, JsonOptions, Time};
+use ros::plumbing;
 use ros::schema::{MessageType, Registry};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::frames::{self, Frames};
 use super::lender::AnyService;
-use super::{ProbeOptions, is_plumbing, plausible, settle};
+use super::{ProbeOptions, plausible, settle};
 
 /// How long a node may take to tell the type of an input, and to connect: of its own time.
 const ANSWER: Duration = Duration::from_secs(5);
@@ -51,6 +54,8 @@ pub(super) struct Feed<'a> {
     /// What nodes said last, at level WARN and above.
     said: BTreeMap<String, String>,
     lender: Option<Arc<AnyService>>,
+    /// Services that were looked for and are served here (ROS 2).
+    served: BTreeMap<String, Box<dyn Send + Sync>>,
     beats: BTreeMap<&'static str, Beat>,
     given: BTreeMap<String, Box<dyn Publisher>>,
     refused: BTreeMap<String, String>,
@@ -94,6 +99,7 @@ impl<'a> Feed<'a> {
                 .ok(),
             said: BTreeMap::new(),
             lender: None,
+            served: BTreeMap::new(),
             beats: BTreeMap::new(),
             given: BTreeMap::new(),
             refused: BTreeMap::new(),
@@ -142,7 +148,8 @@ impl<'a> Feed<'a> {
     }
 
     async fn surroundings(&mut self, graph: &Graph) -> bool {
-        let heard = self.listen() | self.frames_of_parameters(graph).await;
+        let told = self.frames_of_parameters(graph).await | self.frames_of_nodes(graph).await;
+        let heard = self.listen() | told;
         let (clock, timed) = ends(graph, CLOCK, &self.options.own_name);
         let listens = |topic: &&str| ends(graph, topic, &self.options.own_name).0;
         let mut new = false;
@@ -157,14 +164,52 @@ impl<'a> Feed<'a> {
             !graph.services.contains_key(name)
                 && nodes.iter().any(|node| *node != self.options.own_name)
         });
-        if looked_for && self.lender.is_none() {
-            let lender = AnyService::new(self.registry, &self.options.own_name);
-            let lent = async { self.bus.lending()?.lend(lender.clone()).await };
-            match lent.await {
-                Ok(()) => new = true,
-                Err(error) => tracing::warn!("services cannot be lent to a package: {error}"),
+        if !looked_for {
+            return new;
+        }
+        let lender = match &self.lender {
+            Some(lender) => Arc::clone(lender),
+            None => {
+                let lender = AnyService::new(self.registry, &self.options.own_name);
+                if self.options.ros == RosVersion::One {
+                    let lent = async { self.bus.lending()?.lend(lender.clone()).await };
+                    match lent.await {
+                        Ok(()) => new = true,
+                        Err(error) => {
+                            tracing::warn!("services cannot be lent to a package: {error}");
+                        }
+                    }
+                }
+                Arc::clone(self.lender.insert(lender))
             }
-            self.lender = Some(lender);
+        };
+        // Clients of ROS 2 tell of which type they look for a service.
+        if self.options.ros == RosVersion::Two {
+            new |= self.serve(graph, &lender).await;
+        }
+        new
+    }
+
+    /// Serves what is looked for, of the types that its clients tell; whether any of it is new.
+    async fn serve(&mut self, graph: &Graph, lender: &Arc<AnyService>) -> bool {
+        let mut new = false;
+        for (name, nodes) in &graph.sought {
+            let mut clients = nodes.iter().filter(|node| **node != self.options.own_name);
+            let of = clients.find_map(|node| graph.ends.get(node)?.clients.get(name));
+            let known = graph.services.contains_key(name) || self.served.contains_key(name);
+            let Some((of, false)) = of.map(|of| (of, known)) else {
+                continue;
+            };
+            let Some((of, handler)) = lender.serves(self.registry, name, &of.name, nodes) else {
+                continue;
+            };
+            match self.bus.serve(name, of, handler).await {
+                Ok(guard) => {
+                    self.served.insert(name.clone(), guard);
+                    new = true;
+                }
+                Err(error) => tracing::warn!("{name} cannot be served to a package: {error}"),
+            }
         }
         new
     }
@@ -176,14 +221,16 @@ impl<'a> Feed<'a> {
         };
         let mut new = false;
         while let Some(message) = log.messages.try_recv() {
-            let Some((level, node, text)) = read_log(self.registry, &message.bytes) else {
+            let Some((level, node, text)) =
+                read_log(self.registry, self.options.ros, &message.bytes)
+            else {
                 continue;
             };
             if node == self.options.own_name {
                 continue;
             }
             new |= self.frames.lock().hear(&text);
-            if level >= 4 && text.to_lowercase().contains("wait") {
+            if level >= warning(self.options.ros) && text.to_lowercase().contains("wait") {
                 self.said.insert(node, text);
             }
         }
@@ -207,12 +254,42 @@ impl<'a> Feed<'a> {
         new
     }
 
+    /// The same of parameters that nodes have of their own.
+    async fn frames_of_nodes(&mut self, graph: &Graph) -> bool {
+        let Ok(parameters) = self.bus.node_parameters() else {
+            return false;
+        };
+        let mut new = false;
+        for node in graph.nodes.keys() {
+            let list = graph.services.get(&format!("{node}/list_parameters"));
+            let own = *node == self.options.own_name;
+            if own || list != Some(node) || !self.parameters.insert(node.clone()) {
+                continue;
+            }
+            let asked = async {
+                let mut names = parameters.list(node, &[], 0).await?.names;
+                names.retain(|name| frames::is_parameter(&name.replace('.', "/")));
+                match names.is_empty() {
+                    true => Ok(Vec::new()),
+                    false => parameters.get(node, &names).await,
+                }
+            };
+            let values = self.answered(asked).await;
+            for value in values.and_then(Result::ok).into_iter().flatten() {
+                if let Some(ParamValue::String(name)) = value {
+                    new |= self.frames.lock().add(&name);
+                }
+            }
+        }
+        new
+    }
+
     /// Publishes again and again; whether that is new.
     async fn beat(&mut self, topic: &'static str, usual: &str) -> bool {
         if self.beats.contains_key(topic) || self.refused.contains_key(topic) {
             return false;
         }
-        let (message, publisher) = match self.advertise(topic, Some(usual)).await {
+        let (message, publisher) = match self.advertise(topic, Some(usual), false).await {
             Ok(Some(pair)) => pair,
             Ok(None) => return false,
             Err(reason) => {
@@ -253,10 +330,11 @@ impl<'a> Feed<'a> {
     /// if there was none.
     async fn inputs(&mut self, graph: &Graph) -> Option<Duration> {
         let mut longest = None;
-        for (name, topic) in &graph.topics {
+        for name in graph.topics.keys() {
             let (subscribed, published) = ends(graph, name, &self.options.own_name);
-            let apart =
-                name == CLOCK || TRANSFORMS.contains(&name.as_str()) || is_plumbing(name, topic);
+            let apart = name == CLOCK
+                || TRANSFORMS.contains(&name.as_str())
+                || plumbing::topic(graph, name);
             let known = self.given.contains_key(name)
                 || self.refused.contains_key(name)
                 || self.goals.contains(name);
@@ -264,10 +342,12 @@ impl<'a> Feed<'a> {
                 continue;
             }
             let began = Instant::now();
-            match self.advertise(name, None).await {
+            let demanded = demands_latched(graph, name);
+            match self.advertise(name, None, demanded).await {
                 Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
                     Ok(bytes) => {
-                        // Not latched, which would reach whoever is late, too: relays latch what was latched.
+                        // Not latched unless it is asked for, which would reach whoever is late, too: relays latch what
+                        // was latched.
                         let _ = self.answered(reaches(publisher.matched(), 1)).await;
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
@@ -298,6 +378,7 @@ impl<'a> Feed<'a> {
         &mut self,
         topic: &str,
         usual: Option<&str>,
+        latching: bool,
     ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
         let asked = match self.answered(self.bus.topic_type(topic)).await {
             Some(Ok(wire)) => wire.name,
@@ -321,7 +402,11 @@ impl<'a> Feed<'a> {
             .map_err(|error| error.to_string())?;
         let publisher = self
             .bus
-            .advertise(topic, WireType::of(&message), Qos::keep_last(10))
+            .advertise(
+                topic,
+                WireType::of(&message),
+                Qos::keep_last(10).latching(latching),
+            )
             .await;
         Ok(Some((
             message,
@@ -338,12 +423,39 @@ fn ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
     })
 }
 
-/// Level, node and text of a `rosgraph_msgs/Log`.
-fn read_log(registry: &Registry, bytes: &[u8]) -> Option<(u64, String, String)> {
-    let log = registry.message("rosgraph_msgs/Log").ok()?;
+/// Whether a subscriber hears those publishers alone that keep their last message for it.
+fn demands_latched(graph: &Graph, topic: &str) -> bool {
+    let mut ends = graph.ends.values();
+    ends.any(|ends| {
+        let end = ends.subscribers.get(topic);
+        end.is_some_and(|(_, qos)| qos.is_latching())
+    })
+}
+
+/// From which level on a node warns.
+fn warning(ros: RosVersion) -> u64 {
+    match ros {
+        // WARN of rosgraph_msgs/Log is a bit.
+        RosVersion::One => 4,
+        RosVersion::Two => 30,
+    }
+}
+
+/// Level, node and text of a line of a node's log. (`rosgraph_msgs/Log`, of ROS 2 `rcl_interfaces/msg/Log`, which has the
+/// logger's name, dots for slashes.)
+fn read_log(registry: &Registry, ros: RosVersion, bytes: &[u8]) -> Option<(u64, String, String)> {
+    let log = registry.message(match ros {
+        RosVersion::One => "rosgraph_msgs/Log",
+        RosVersion::Two => "rcl_interfaces/msg/Log",
+    });
+    let log = log.ok()?;
     let mut json = Vec::new();
     codec::to_json(&log, bytes, &mut json, &JsonOptions::default()).ok()?;
     let log: serde_json::Value = serde_json::from_slice(&json).ok()?;
     let text = |field: &str| log[field].as_str().map(str::to_owned);
-    Some((log["level"].as_u64()?, text("name")?, text("msg")?))
+    let name = match ros {
+        RosVersion::One => text("name")?,
+        RosVersion::Two => format!("/{}", text("name")?.replace('.', "/")),
+    };
+    Some((log["level"].as_u64()?, name, text("msg")?))
 }

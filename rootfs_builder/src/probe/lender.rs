@@ -42,6 +42,30 @@ impl AnyService {
         })
     }
 
+    /// What answers the service of this name and type in the place of its server, and the type as it is defined; none of
+    /// a type that the image does not define.
+    pub(super) fn serves(
+        &self,
+        registry: &Registry,
+        service: &str,
+        type_name: &str,
+        nodes: &[String],
+    ) -> Option<(ServiceType, Arc<dyn ServiceHandler>)> {
+        let found = registry.service(type_name).ok()?;
+        let nodes = nodes.iter().filter(|node| **node != self.own_name);
+        let mut asked = self.asked.lock();
+        asked
+            .entry(service.to_owned())
+            .or_default()
+            .extend(nodes.cloned());
+        let of = ServiceType::of(&found);
+        let answers = Answers {
+            by_digest: self.by_digest.clone(),
+            service: Some(found),
+        };
+        Some((of, Arc::new(answers)))
+    }
+
     /// Services that were looked for, with the nodes that did.
     pub(super) fn asked(&self) -> BTreeMap<String, BTreeSet<String>> {
         self.asked.lock().clone()
@@ -100,7 +124,29 @@ impl ServiceHandler for Answers {
 
 #[cfg(test)]
 mod tests {
+    use ros::bus::RosVersion;
+
     use super::*;
+
+    #[tokio::test]
+    async fn a_server_of_ros_2_is_stood_in_for() {
+        let text = "---\nbool success\nstring message\n".to_owned();
+        let definitions = [("lab/srv/Do".to_owned(), text)].into();
+        let registry = Registry::of_definitions(RosVersion::Two, &definitions).expect("valid");
+        let any = AnyService::new(&registry, "/looker");
+        let nodes = ["/node".to_owned(), "/looker".to_owned()];
+        let served = any.serves(&registry, "/do", "lab/srv/Do", &nodes);
+        let (of, handler) = served.expect("defined");
+        assert_eq!(of.name, "lab/srv/Do");
+        let answer = handler.call(Bytes::new(), "/node").await.expect("answered");
+        // The header of CDR, false, and an empty text with its length.
+        assert_eq!(answer[..], [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0]);
+        assert_eq!(any.asked()["/do"], ["/node".to_owned()].into());
+        assert!(
+            any.serves(&registry, "/x", "lab/srv/None", &nodes)
+                .is_none()
+        );
+    }
 
     #[tokio::test]
     async fn a_caller_is_answered_as_its_type_asks() {

@@ -35,8 +35,15 @@ fn fields(message: &MessageType) -> Map<String, Value> {
             }
         }
     }
-    if let Some(Value::Object(values)) = VALUES.get(message.name()) {
-        merge(&mut object, values);
+    // ROS 2 has a kind in its names, and no capitals in those of fields.
+    let name = message.name().replacen("/msg/", "/", 1);
+    if let Some(Value::Object(values)) = VALUES.get(&name) {
+        let known = values.iter().filter_map(|(key, value)| {
+            let mut fields = message.fields().iter();
+            let field = fields.find(|field| field.name.eq_ignore_ascii_case(key))?;
+            Some((field.name.to_string(), value.clone()))
+        });
+        merge(&mut object, &known.collect());
     }
     object
 }
@@ -95,6 +102,25 @@ mod tests {
             "all": [], "last": {"times": 0, "by": {"x": 0.0, "w": 1.0}}
         });
         assert_eq!(seen, expected);
+    }
+
+    #[test]
+    fn types_of_ros_2_have_the_same_values() {
+        let definitions = [(
+            "sensor_msgs/msg/CameraInfo".to_owned(),
+            "uint32 height\nfloat64[] d\nfloat64[9] k\n".to_owned(),
+        )];
+        let registry = Registry::of_definitions(ros::bus::RosVersion::Two, &definitions.into())
+            .expect("valid");
+        let info = registry
+            .message("sensor_msgs/msg/CameraInfo")
+            .expect("defined");
+        let bytes = message(&info, Time::default()).expect("a message");
+        let mut json = Vec::new();
+        codec::to_json(&info, &bytes, &mut json, &codec::JsonOptions::default()).expect("valid");
+        let seen: Value = serde_json::from_slice(&json).expect("JSON");
+        assert_eq!((&seen["height"], &seen["k"][0]), (&48.into(), &60.0.into()));
+        assert_eq!(seen["d"].as_array().map(Vec::len), Some(5));
     }
 
     #[test]

@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros::bus::{Graph, TopicNodes};
+use ros::bus::{ActionNodes, Graph, TopicNodes};
+use ros::plumbing;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
-use super::{ProbeError, ProbeOptions, Worked, describe, is_plumbing};
+use super::{ProbeError, ProbeOptions, Worked, describe};
 
 async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeError> {
     watch.changed().await.map_err(|_| ProbeError::MasterGone)
@@ -181,32 +182,30 @@ async fn differs(
 /// Whether nobody has registered anything yet but what every node has. (Of several nodes some may never show
 /// anything, such as those that load nodelets into others.)
 fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
-    const SERVICES: [&str; 5] = [
-        "get_loggers",
-        "set_logger_level",
-        "load_nodelet",
-        "unload_nodelet",
-        "list",
-    ];
+    const NODELETS: [&str; 3] = ["load_nodelet", "unload_nodelet", "list"];
     let own = |node: &String| *node == options.own_name;
     let topics = graph.topics.iter().any(|(name, topic)| {
         let mut ends = topic.publishers.iter().chain(&topic.subscribers);
-        !is_plumbing(name, topic) && ends.any(|node| !own(node))
+        !plumbing::topic(graph, name) && ends.any(|node| !own(node))
     });
     let services = graph.services.iter().any(|(name, server)| {
         !own(server)
             && name
                 .rsplit('/')
                 .next()
-                .is_some_and(|last| !SERVICES.contains(&last))
+                .is_some_and(|last| !NODELETS.contains(&last))
+            && !plumbing::service(options.ros, graph, name)
     });
-    !topics && !services
+    let actions = graph.actions.values();
+    let served = actions.flat_map(|action| &action.servers);
+    !topics && !services && !served.into_iter().any(|node| !own(node))
 }
 
 /// What of a graph is looked at for changes.
 pub(super) type Shape = (
     BTreeMap<String, TopicNodes>,
     BTreeMap<String, String>,
+    BTreeMap<String, ActionNodes>,
     BTreeSet<String>,
     usize,
     usize,
@@ -217,6 +216,7 @@ pub(super) fn shape(graph: &Graph) -> Shape {
     (
         graph.topics.clone(),
         graph.services.clone(),
+        graph.actions.clone(),
         nodes,
         graph.parameters.len(),
         graph.sought.len(),

@@ -12,6 +12,9 @@ use tokio::net::TcpListener;
 use super::*;
 
 mod feeding;
+#[path = "../../../tests/support/memory_bus.rs"]
+mod memory_bus;
+mod of_two;
 
 const STRING: (&str, &str) = ("std_msgs/msg/String", "string data\n");
 const ADD: (&str, &str) = ("lab/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n");
@@ -108,10 +111,10 @@ impl Lab {
         options: &ProbeOptions,
         exited: impl Future<Output = String> + Send,
     ) -> Result<Found, ProbeError> {
-        let bus = Ros1Bus::connect(Arc::new(HostSockets), self.address, "/looker")
+        let bus: Arc<dyn Bus> = Ros1Bus::connect(Arc::new(HostSockets), self.address, "/looker")
             .await
             .expect("joined");
-        let found = probe(&*bus, &self.registry, &self.definitions, options, exited).await;
+        let found = probe(&bus, &self.registry, &self.definitions, options, exited).await;
         bus.close().await;
         found
     }
@@ -296,7 +299,7 @@ async fn a_node_that_still_works_is_waited_for() {
     let _first = lab
         .advertises("/first", lab.wire("std_msgs/String"), false)
         .await;
-    let bus = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker")
+    let bus: Arc<dyn Bus> = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker")
         .await
         .expect("joined");
     // Asked a third time it is done, and only then has its input. Were it not waited for, what it does then would
@@ -328,7 +331,7 @@ async fn a_node_that_still_works_is_waited_for() {
         ..ProbeOptions::new(vec!["/package".into()], "/looker")
     };
     let found = probe(
-        &*bus,
+        &bus,
         &lab.registry,
         &lab.definitions,
         &options,

@@ -112,6 +112,23 @@ pub struct Servant {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub hung: Vec<String>,
+    /// Its nodes that have a lifecycle (ROS 2), and where they are in it.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub lifecycle: Vec<NodeStage>,
+}
+
+/// Where a node is in its lifecycle.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct NodeStage {
+    /// Its name.
+    pub node: String,
+    /// In ROS's own word: `unconfigured`, `inactive`, `active`, `finalized`, or one between two of them.
+    pub state: String,
+    /// Why it is not active although it was told to be.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refused: Option<String>,
 }
 
 /// Messages of a topic that were dropped.

@@ -48,11 +48,26 @@ impl Choreographer {
             response: inner.recent.shown(&handle.id, Instant::now().into_std()),
             pids: pids.unwrap_or_default(),
             dropped: reach.as_ref().map_or(0, |reach| reach.dropped()),
+            lifecycle: reach.as_deref().map(lifecycle).unwrap_or_default(),
             drops: reach.map(|reach| drops(&*reach)).unwrap_or_default(),
             down: handle.down(),
             hung: handle.hung(),
         }
     }
+}
+
+/// Nodes that have a lifecycle, and where they are in it.
+fn lifecycle(reach: &dyn Reach) -> Vec<api::NodeStage> {
+    let stages = reach.lifecycles();
+    let stages = stages.map(|stages| stages.borrow().clone());
+    let stages = stages.unwrap_or_default().into_iter();
+    stages
+        .map(|(node, stage)| api::NodeStage {
+            node,
+            state: stage.state,
+            refused: stage.refused,
+        })
+        .collect()
 }
 
 /// Topics that lost most.

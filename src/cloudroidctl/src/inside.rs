@@ -10,6 +10,7 @@ use foxglove::ws_protocol::server::ServerMessage;
 use futures_util::{SinkExt, StreamExt};
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
+use recording::Format;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
@@ -20,9 +21,6 @@ use crate::client::{Client, escaped};
 
 /// Of the daemon's, see docs/page.md.
 const PROTOCOL: &str = "foxglove.sdk.v1";
-
-/// How messages are written, and how their definitions are.
-pub const ENCODING: &str = "ros1";
 
 /// The id of the servant that is named by its id, or by a service that has no other.
 pub async fn servant(client: &Client, named: &str) -> anyhow::Result<String> {
@@ -52,6 +50,8 @@ pub async fn servant(client: &Client, named: &str) -> anyhow::Result<String> {
 /// One connection.
 pub struct Inside<S = TokioIo<Upgraded>> {
     socket: WebSocketStream<S>,
+    /// Which ROS the servant's messages are of.
+    pub format: Format,
     /// What has come while something was sent, and when.
     ahead: VecDeque<(Instant, Message)>,
 }
@@ -61,7 +61,9 @@ impl Inside {
     pub async fn attach(client: &Client, servant: &str, depth: usize) -> anyhow::Result<Self> {
         let path = format!("/foxglove/{}?depth={depth}", escaped(servant));
         let socket = client.socket(&path, PROTOCOL).await?;
-        Ok(Self::of(socket))
+        let mut inside = Self::of(socket);
+        inside.greeted().await?;
+        Ok(inside)
     }
 }
 
@@ -69,7 +71,24 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
     fn of(socket: WebSocketStream<S>) -> Self {
         Self {
             socket,
+            format: Format::default(),
             ahead: VecDeque::new(),
+        }
+    }
+
+    /// Takes the daemon's first message, which says how messages are written.
+    async fn greeted(&mut self) -> anyhow::Result<()> {
+        let Some(message) = self.next().await? else {
+            bail!("the servant has ended");
+        };
+        match read(&message) {
+            Some(ServerMessage::ServerInfo(told)) => {
+                let mut encodings = told.supported_encodings.iter();
+                let known = encodings.find_map(|encoding| Format::of_encoding(encoding));
+                self.format = known.unwrap_or_default();
+                Ok(())
+            }
+            _ => bail!("the daemon does not greet as the protocol {PROTOCOL} has it"),
         }
     }
 

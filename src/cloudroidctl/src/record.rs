@@ -13,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 
 use crate::client::Client;
-use crate::inside::{self, ENCODING, Inside};
+use crate::inside::{self, Inside};
 use crate::output::{self, Format};
 use crate::token::lifetime;
 use crate::topics::Topics;
@@ -43,7 +43,7 @@ impl Record {
     pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
         let servant = inside::servant(client, &self.servant).await?;
         let inside = Inside::attach(client, &servant, DEPTH).await?;
-        let writer = Writer::create(&self.output)
+        let writer = Writer::create(&self.output, inside.format)
             .context("-o is to name a new file, in a directory that exists")?;
         output::complain(&format!(
             "recording {servant} into {}; Ctrl-C ends it",
@@ -142,7 +142,8 @@ impl Recorder {
     }
 
     async fn subscribe(&mut self, channel: &Channel<'_>) -> anyhow::Result<()> {
-        if !self.topics.want(&channel.topic) || channel.encoding != ENCODING {
+        let encoding = self.inside.format.encoding();
+        if !self.topics.want(&channel.topic) || channel.encoding != encoding {
             return Ok(());
         }
         let Ok(definition) = channel.decode_schema() else {

@@ -15,14 +15,14 @@ use tokio::time::{Instant, sleep_until};
 use tokio_tungstenite::tungstenite::Message;
 
 use crate::client::Client;
-use crate::inside::{self, ENCODING, Inside};
+use crate::inside::{self, Inside};
 use crate::output::{self, Format};
 use crate::topics::Topics;
 
 /// Messages of a topic that wait for a node that is slow.
 const DEPTH: usize = 1000;
 
-/// Publish the messages of an MCAP file of ROS 1 in a servant, as far apart as they were recorded.
+/// Publish the messages of an MCAP file in a servant of the same ROS, as far apart as they were recorded.
 #[derive(Debug, clap::Args)]
 pub struct Replay {
     /// The file, such as record writes.
@@ -180,10 +180,15 @@ impl Player {
     }
 
     async fn publish(&mut self, played: &Played) -> anyhow::Result<()> {
-        if played.encoding != ENCODING {
+        let encoding = self.inside.format.encoding();
+        if played.encoding != encoding {
             let why = format!(
-                "it is written as {:?}, and servants take {ENCODING}",
-                played.encoding
+                "it is written as {:?}, and this servant takes {encoding}: its service is of {}; replay it to one of the other ROS",
+                played.encoding,
+                match self.inside.format {
+                    recording::Format::Ros1 => "ROS 1",
+                    recording::Format::Ros2 => "ROS 2",
+                }
             );
             self.left_out.insert(played.topic.clone(), why);
             return Ok(());
@@ -200,8 +205,9 @@ impl Player {
 
     async fn advertise(&mut self, topic: &str, of: &str) -> anyhow::Result<u32> {
         let channel = u32::try_from(self.channels.len())?;
-        let schema = Schema::new(of, "ros1msg", &b""[..]);
-        let told = Channel::builder(channel, topic, ENCODING).with_schema(schema);
+        let format = self.inside.format;
+        let schema = Schema::new(of, format.schema(), &b""[..]);
+        let told = Channel::builder(channel, topic, format.encoding()).with_schema(schema);
         self.inside.send(&Advertise::new([told.build()?])).await?;
         self.channels.insert(topic.to_owned(), channel);
         Ok(channel)

@@ -119,7 +119,14 @@ fn state(servant: &Servant) -> String {
             )
         })
         .collect();
-    let down: Vec<String> = down.into_iter().chain(servant.hung.clone()).collect();
+    let stages = servant.lifecycle.iter();
+    let idle = stages.filter(|stage| stage.state != "active");
+    let idle = idle.map(|stage| match &stage.refused {
+        Some(refused) => refused.clone(),
+        None => format!("{} is {}", stage.node, stage.state),
+    });
+    let down = down.into_iter().chain(servant.hung.clone());
+    let down: Vec<String> = down.chain(idle).collect();
     match &servant.reason {
         Some(reason) => format!("{}: {reason}", servant.phase),
         None if !down.is_empty() => format!("{}: {}", servant.phase, down.join(", ")),

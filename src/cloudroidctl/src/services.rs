@@ -81,11 +81,10 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
             api::interface::Direction::Output => "output",
         };
         let marks = [(topic.latched, "latched"), (topic.lazy, "lazy")];
-        let marks: Vec<&str> = marks
-            .iter()
-            .filter(|(set, _)| *set)
-            .map(|(_, mark)| *mark)
-            .collect();
+        let marks = marks.iter().filter(|(set, _)| *set);
+        let marks = marks.map(|(_, mark)| (*mark).to_owned());
+        let qos = topic.qos.map(|qos| qos.to_string());
+        let marks: Vec<String> = marks.chain(qos).collect();
         topics.row([
             topic.name.clone(),
             topic.type_name.clone(),
@@ -105,11 +104,20 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.needs {
         needs.row([entry.name.clone(), entry.nodes.join(", ")]);
     }
-    let mut parameters = Table::new(&["PARAMETER", "VALUE"]);
+    let mut lifecycle = Table::new(&["NODE WITH A LIFECYCLE"]);
+    for node in &service.interface.lifecycle {
+        lifecycle.row([node.clone()]);
+    }
+    let mut parameters = Table::new(&["PARAMETER", "VALUE", ""]);
     for entry in &service.interface.parameters {
         parameters.row([
             entry.name.clone(),
             entry.value.as_ref().map(shortened).unwrap_or_default(),
+            entry
+                .descriptor
+                .as_ref()
+                .map(ToString::to_string)
+                .unwrap_or_default(),
         ]);
     }
     let mut revisions = Table::new(&["REVISION", "PUBLISHED", "", "SOURCE", "IMAGE"]);
@@ -134,6 +142,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
         &services,
         &needs,
         &actions,
+        &lifecycle,
         &parameters,
         &revisions,
     ] {

@@ -1,4 +1,4 @@
-//! `cloudroidd shim`: the process that a servant belongs to, composed of the container's shim and the servant's
+//! `cloudroidd shim`: the process that a servant belongs to, composed of the container's shim and, of a servant of ROS 1, its
 //! ROS Master. It outlives the daemon. Runs before any thread or runtime is started, because libcontainer forks.
 
 use std::future::Future;
@@ -12,7 +12,7 @@ use serde::Deserialize;
 use servant::shim::{Resident, ResidentContext, ResidentError};
 use tokio::net::TcpListener;
 
-/// The ROS Master in the shim.
+/// The ROS Master in the shim, where there is one.
 #[derive(Default)]
 pub struct MasterResident {
     master: Option<Master>,
@@ -28,6 +28,9 @@ impl Resident for MasterResident {
                 serde_json::Value::Null => MasterConfig::default(),
                 config => MasterConfig::deserialize(config)?,
             };
+            if !config.master {
+                return Ok(());
+            }
             // The shim's thread is in the servant's network namespace.
             let listener = TcpListener::bind(master::ADDRESS).await?;
             let master = Master::new(MasterOptions {

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use budget::{Budget, Permit};
 use parking_lot::Mutex;
-use recording::{Summary, Writer};
-use ros::bus::{Message, WireType};
+use recording::{Format, Summary, Writer};
+use ros::bus::{Message, RosVersion, WireType};
 
 use crate::follow::{Followed, Observer, Seen, follow, now};
 use crate::numbered::Numbered;
@@ -46,6 +46,7 @@ pub struct Frozen {
 }
 
 struct Inner {
+    format: Format,
     options: BoxOptions,
     /// Locked before the ring, where both are.
     topics: Mutex<Numbered<Topic>>,
@@ -69,6 +70,10 @@ impl BlackBox {
             bytes: options.bytes,
         });
         let inner = Arc::new(Inner {
+            format: match seen.bus.version() {
+                RosVersion::One => Format::Ros1,
+                RosVersion::Two => Format::Ros2,
+            },
             options,
             topics: Mutex::default(),
             ring: Mutex::new(ring),
@@ -80,13 +85,18 @@ impl BlackBox {
         }
     }
 
+    /// How a file of it is to be written.
+    pub fn format(&self) -> Format {
+        self.inner.format
+    }
+
     /// Lets go of what is too old by now, also where nothing comes any more.
     pub fn forget(&self) {
         self.inner.ring.lock().forget(now());
         self.inner.forget_topics(&mut self.inner.topics.lock());
     }
 
-    /// Writes what is kept into a file; blocks.
+    /// Writes what is kept into a file of this box's [`format`](Self::format); blocks.
     ///
     /// # Errors
     /// The file cannot be written; it may be there in part then.
@@ -204,6 +214,7 @@ mod tests {
             bytes: 1 << 20,
         };
         Inner {
+            format: Format::Ros1,
             options: BoxOptions {
                 span: bounds.span,
                 bytes: bounds.bytes,

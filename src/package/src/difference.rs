@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crate::interface::{Action, Direction, Interface, Parameter, Service, Topic};
+use crate::interface::{Action, Direction, Interface, Parameter, Qos, Service, Topic};
+use crate::names;
 
 /// One thing that is different.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -116,7 +117,26 @@ impl Changes {
                 (false, true) => changes.note(format!("{what} is latched now")),
                 _ => {}
             }
+            if let (Some(before), Some(after)) = (old.qos, new.qos) {
+                changes.qos(what, new.direction, before, after);
+            }
         });
+    }
+
+    /// Where it offers less than before, or asks for more, robots that fitted do not hear it, or are not heard.
+    fn qos(&mut self, what: &str, direction: Direction, before: Qos, after: Qos) {
+        if before == after {
+            return;
+        }
+        let suits = match direction {
+            Direction::Output => before.least(after) == before,
+            Direction::Input => before.most(after) == before,
+        };
+        let text = format!("the quality of service of {what} is {after} and was {before}");
+        match suits {
+            true => self.note(text),
+            false => self.breaks(text),
+        }
     }
 
     fn services(&mut self, old: &[Service], new: &[Service]) {
@@ -129,10 +149,10 @@ impl Changes {
     fn actions(&mut self, old_all: &Interface, new_all: &Interface) {
         let key = |action: &Action| format!("action {}", action.name);
         let definition = |all: &Interface, action: &Action| {
-            let (package, name) = action.type_name.split_once('/')?;
-            all.definitions
-                .get(&format!("{package}/action/{name}"))
-                .map(|text| essence(text))
+            let text = all
+                .definitions
+                .get(&names::key(&action.type_name, "action"));
+            text.map(|text| essence(text))
         };
         self.pair(
             &old_all.actions,
@@ -192,6 +212,7 @@ fn essence(text: &str) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::interface::Reliability;
 
     fn old() -> Interface {
         let topic = |name: &str, direction, latched| Topic {
@@ -202,12 +223,12 @@ mod tests {
             nodes: vec!["/n".into()],
             latched,
             lazy: false,
+            qos: None,
         };
         let parameter = |name: &str, value: i64| Parameter {
             name: name.into(),
             value: Some(value.into()),
-            read_by: vec![],
-            written_by: vec![],
+            ..Parameter::default()
         };
         Interface {
             late: Vec::new(),
@@ -228,6 +249,7 @@ mod tests {
             }],
             parameters: vec![parameter("/p", 1)],
             needs: Vec::new(),
+            lifecycle: Vec::new(),
             definitions: [(
                 "a/action/Go".to_owned(),
                 "int32 x # goal\n---\n---\n".to_owned(),
@@ -268,6 +290,52 @@ mod tests {
                 "  service /s is new"
             ]
         );
+    }
+
+    #[test]
+    fn an_output_that_offers_less_and_an_input_that_asks_for_more_break() {
+        let with = |at: usize, qos: Qos| {
+            let mut interface = old();
+            interface.topics[at].qos = Some(qos);
+            interface
+        };
+        let (weak, strong) = (
+            Qos {
+                reliability: Reliability::BestEffort,
+                ..Qos::default()
+            },
+            Qos::default(),
+        );
+        for (at, from, to, compatible) in [
+            (1, strong, weak, false),
+            (1, weak, strong, true),
+            (0, weak, strong, false),
+            (0, strong, weak, true),
+        ] {
+            let difference = Difference::between(&with(at, from), &with(at, to));
+            assert_eq!(difference.changes.len(), 1, "{difference}");
+            assert_eq!(difference.compatible(), compatible, "{difference}");
+        }
+        let text = Difference::between(&with(1, strong), &with(1, weak)).to_string();
+        assert_eq!(
+            text,
+            "! the quality of service of output topic /out is best_effort, volatile and was reliable, volatile\n"
+        );
+    }
+
+    #[test]
+    fn actions_of_ros_2_are_compared_by_their_definitions() {
+        let go = |text: &str| Interface {
+            actions: vec![Action {
+                name: "/go".into(),
+                type_name: "a/action/Go".into(),
+                node: "/n".into(),
+            }],
+            definitions: [("a/action/Go".to_owned(), text.to_owned())].into(),
+            ..Interface::default()
+        };
+        let difference = Difference::between(&go("---\n---\n"), &go("int8 x\n---\n---\n"));
+        assert!(!difference.compatible(), "{difference}");
     }
 
     #[test]

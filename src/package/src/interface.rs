@@ -4,6 +4,12 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+mod descriptor;
+mod qos;
+
+pub use descriptor::{Descriptor, Range};
+pub use qos::{Durability, Liveliness, Qos, Reliability};
+
 /// Topics, services, actions and parameters with their definitions.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -16,13 +22,16 @@ pub struct Interface {
     pub topics: Vec<Topic>,
     /// Services, by name.
     pub services: Vec<Service>,
-    /// Actions (actionlib), by name; their five topics are not repeated in `topics`.
+    /// Actions, by name; topics and services that they are made of are not repeated in `topics` and `services`.
     pub actions: Vec<Action>,
-    /// Parameters that a node read or wrote, by name.
+    /// Parameters that a node read or wrote, or has of its own (ROS 2), by name.
     pub parameters: Vec<Parameter>,
     /// Services that nodes of the package call and none of them serves, by name.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<Need>,
+    /// Nodes that have a lifecycle (ROS 2), by name; the services of it are not repeated in `services`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub lifecycle: Vec<String>,
     /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`:
     /// those used above and all they refer to.
     pub definitions: BTreeMap<String, String>,
@@ -43,11 +52,11 @@ pub enum Direction {
 pub struct Topic {
     /// Absolute name, such as `/image`.
     pub name: String,
-    /// `package/Type`.
+    /// `package/Type`, of ROS 2 `package/msg/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of the type, lower-case hex, as the node announced it and as the definition gives it. Empty where it is
-    /// not known yet, as in a supplement.
+    /// MD5 of the type, lower-case hex, or its type hash (ROS 2), as the node announced it and as the definition gives it.
+    /// Empty where it is not known yet, as in a supplement.
     #[serde(default)]
     pub md5: String,
     /// Which end the package holds.
@@ -61,6 +70,9 @@ pub struct Topic {
     /// Registered only while an output is subscribed to, or once the node has been given what it waits for.
     #[serde(default)]
     pub lazy: bool,
+    /// What the package's nodes offer, or ask for, where ends tell it (ROS 2): of several ends, what suits all of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub qos: Option<Qos>,
 }
 
 /// A service the package serves.
@@ -68,10 +80,10 @@ pub struct Topic {
 pub struct Service {
     /// Absolute name.
     pub name: String,
-    /// `package/Type`.
+    /// `package/Type`, of ROS 2 `package/srv/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of request and response. Empty where it is not known yet.
+    /// MD5, or type hash, of request and response. Empty where it is not known yet.
     #[serde(default)]
     pub md5: String,
     /// The serving node. Empty where it is not known.
@@ -79,12 +91,12 @@ pub struct Service {
     pub node: String,
 }
 
-/// An action the package serves (actionlib: goal, cancel, status, feedback, result).
+/// An action the package serves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Action {
     /// Absolute name, without the `/goal` of its topics.
     pub name: String,
-    /// `package/Name` of the `.action` file, without `Action`.
+    /// `package/Name` of the `.action` file, without `Action`; of ROS 2 `package/action/Name`.
     #[serde(rename = "type")]
     pub type_name: String,
     /// The serving node. Empty where it is not known.
@@ -103,10 +115,13 @@ pub struct Need {
 }
 
 /// A parameter.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Parameter {
-    /// Absolute name.
+    /// Absolute name; of a node's own parameter the node's name, a slash, and what the node calls it: `/see/camera.rate`.
     pub name: String,
+    /// The node whose own it is (ROS 2); empty where nodes share their parameters.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub node: String,
     /// Its value when the interface was found, as JSON; none where it was only asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<serde_json::Value>,
@@ -116,4 +131,15 @@ pub struct Parameter {
     /// Nodes that wrote it.
     #[serde(default)]
     pub written_by: Vec<String>,
+    /// What its node says of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub descriptor: Option<Descriptor>,
+}
+
+impl Parameter {
+    /// What its node calls it; none where nodes share it.
+    pub fn own_name(&self) -> Option<&str> {
+        let below = self.name.strip_prefix(&self.node)?.strip_prefix('/')?;
+        (!self.node.is_empty()).then_some(below)
+    }
 }

@@ -9,7 +9,7 @@ use crate::interface::Interface;
 use crate::{Error, names};
 
 /// Keys that may stand in each table of a file.
-const KEYS: [(&str, &[&str]); 6] = [
+const KEYS: [(&str, &[&str]); 7] = [
     (
         "topics",
         &[
@@ -20,12 +20,24 @@ const KEYS: [(&str, &[&str]); 6] = [
             "nodes",
             "latched",
             "lazy",
+            "qos",
         ],
     ),
     ("services", &["name", "type", "md5", "node"]),
     ("actions", &["name", "type", "node"]),
-    ("parameters", &["name", "value", "read_by", "written_by"]),
+    (
+        "parameters",
+        &[
+            "name",
+            "node",
+            "value",
+            "read_by",
+            "written_by",
+            "descriptor",
+        ],
+    ),
     ("needs", &["name", "nodes"]),
+    ("lifecycle", &[]),
     ("late", &[]),
 ];
 
@@ -80,11 +92,18 @@ impl Interface {
                 .iter()
                 .map(|action| (&action.name, Some(&action.type_name))),
         );
-        let named = named.chain(
-            self.parameters
-                .iter()
-                .map(|parameter| (&parameter.name, None)),
-        );
+        // What a node calls its own parameters is not a graph name: `/see/qos.depth`.
+        let shared = self
+            .parameters
+            .iter()
+            .filter(|parameter| parameter.own_name().is_none_or(|own| !is_own_name(own)));
+        let named = named.chain(shared.map(|parameter| (&parameter.name, None)));
+        let owners = self
+            .parameters
+            .iter()
+            .filter(|parameter| !parameter.node.is_empty());
+        let named = named.chain(owners.map(|parameter| (&parameter.node, None)));
+        let named = named.chain(self.lifecycle.iter().map(|node| (node, None)));
         let mut named = named.chain(self.needs.iter().map(|need| (&need.name, None)));
         named.find_map(|(name, of_type)| {
             if !names::is_graph_name(name) {
@@ -102,6 +121,11 @@ impl Interface {
             ))
         })
     }
+}
+
+/// What a node may call a parameter of its own.
+fn is_own_name(name: &str) -> bool {
+    (1..=512).contains(&name.len()) && !name.chars().any(|c| c.is_control() || c.is_whitespace())
 }
 
 fn without_nulls(value: Value) -> Option<Value> {
@@ -174,7 +198,7 @@ fn wrong(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::interface::{Direction, Need, Parameter, Topic};
+    use crate::interface::{Descriptor, Direction, Durability, Need, Parameter, Qos, Range, Topic};
 
     fn parse(text: &str) -> Result<Interface, Error> {
         Interface::from_toml(text, Path::new("x.toml"))
@@ -241,8 +265,31 @@ value = 0.5
             name: "/asked".into(),
             value: None,
             read_by: vec!["/n".into()],
-            written_by: vec![],
+            ..Parameter::default()
         });
+        // What ROS 2 adds.
+        interface.topics[0].qos = Some(Qos {
+            durability: Durability::TransientLocal,
+            deadline: Some(0.5),
+            ..Qos::default()
+        });
+        interface.lifecycle = vec!["/n".into()];
+        interface.parameters.push(Parameter {
+            name: "/n/camera.rate".into(),
+            node: "/n".into(),
+            value: Some(serde_json::json!([1, 2])),
+            descriptor: Some(Descriptor {
+                kind: "integer_array".into(),
+                read_only: true,
+                range: Some(Range {
+                    from: Some(0.into()),
+                    ..Range::default()
+                }),
+                ..Descriptor::default()
+            }),
+            ..Parameter::default()
+        });
+        assert_eq!(interface.parameters[2].own_name(), Some("camera.rate"));
         interface.needs.push(Need {
             name: "/static_map".into(),
             nodes: vec!["/n".into()],
@@ -288,6 +335,14 @@ value = 0.5
             (
                 "[[parameters]]\nname = \"a\"".to_owned(),
                 "\"a\" is not an absolute name",
+            ),
+            (
+                "[[parameters]]\nname = \"/n/a b\"\nnode = \"/n\"".to_owned(),
+                "\"/n/a b\" is not an absolute name",
+            ),
+            (
+                "lifecycle = [\"n\"]".to_owned(),
+                "\"n\" is not an absolute name",
             ),
             (
                 "[[topic]]\nname = \"a\"".to_owned(),

@@ -55,6 +55,15 @@ pub fn is_full_type(name: &str) -> bool {
     }
 }
 
+/// What the definition of a type is found by: `package/kind/Type`. `kind` (`msg`, `srv`, `action`) is that of names which do
+/// not say, as those of ROS 1.
+pub fn key(type_name: &str, kind: &str) -> String {
+    match type_name.split_once('/') {
+        Some((package, short)) if !short.contains('/') => format!("{package}/{kind}/{short}"),
+        _ => type_name.to_owned(),
+    }
+}
+
 /// An absolute graph name such as `/camera/image_raw`.
 pub fn is_graph_name(name: &str) -> bool {
     name.len() <= 512
@@ -89,6 +98,8 @@ mod tests {
                 && !is_full_type("a/msg/b/C")
                 && !is_full_type("a/msg/")
         );
+        assert_eq!(key("a/B", "srv"), "a/srv/B");
+        assert_eq!(key("a/msg/B", "srv"), "a/msg/B");
         assert!(is_class("image_tools::ShowImage") && !is_class("a::") && !is_class("a b"));
         assert!(
             is_library("lib/libx.so") && !is_library("/lib/libx.so") && !is_library("lib/../x")

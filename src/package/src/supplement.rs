@@ -22,6 +22,7 @@ impl Interface {
         for parameter in &stated.parameters {
             merged.add_parameter(parameter);
         }
+        join(&mut merged.lifecycle, &stated.lifecycle);
         for (key, text) in &stated.definitions {
             match merged.definitions.get(key) {
                 Some(found) if found.trim() != text.trim() => {
@@ -68,6 +69,7 @@ impl Interface {
         )?;
         found.latched |= stated.latched;
         found.lazy |= stated.lazy;
+        found.qos = found.qos.or(stated.qos);
         join(&mut found.nodes, &stated.nodes);
         Ok(())
     }
@@ -119,6 +121,8 @@ impl Interface {
                 found.value = found.value.take().or_else(|| stated.value.clone());
                 join(&mut found.read_by, &stated.read_by);
                 join(&mut found.written_by, &stated.written_by);
+                let said = found.descriptor.take();
+                found.descriptor = said.or_else(|| stated.descriptor.clone());
             }
             None => self.parameters.push(stated.clone()),
         }
@@ -190,12 +194,13 @@ mod tests {
             nodes: vec!["/n".into()],
             latched: false,
             lazy: true,
+            qos: None,
         });
         found.parameters.push(Parameter {
             name: "/threshold".into(),
             value: Some(0.9.into()),
             read_by: vec!["/n".into()],
-            written_by: vec![],
+            ..Parameter::default()
         });
         let mut stated = stated();
         stated.topics.push(Topic {

@@ -559,7 +559,6 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
         C::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
         C::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
         C::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
-        C::StubOfRos2 { .. } => (S::UNPROCESSABLE_ENTITY, "other-ros", "another ROS"),
         C::UnknownArchitecture { .. } => {
             (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
         }

@@ -75,7 +75,9 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
     let file = privileged(move || make(&path)).await;
     let file = file.map_err(|error| failed(format!("{}: {error}", half.display())))?;
     let path = half.clone();
-    let written = tokio::task::spawn_blocking(move || kept.write(Writer::of(&path, file)?)).await;
+    let written =
+        tokio::task::spawn_blocking(move || kept.write(Writer::of(&path, file, kept.format())?))
+            .await;
     let frozen = match written {
         Ok(Ok(frozen)) => frozen,
         error => {

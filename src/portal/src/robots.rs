@@ -220,10 +220,6 @@ async fn connect(
     if caller.is_known() && app.state.service_package(&asked.service)?.is_none() {
         return Err(app.catalogue.unknown(&asked.service)?.into());
     }
-    if asked.link {
-        let revision = app.catalogue.current(&asked.service)?;
-        catalogue::stubs::check_ros(&asked.service, &revision.flavour)?;
-    }
     // Who has not shown a token must be let in to show one. Where there is no room, a stub is told by the HTTP status; a robot
     // that speaks rosbridge alone is let in, and told by status messages where it stands, and why it is refused.
     let lease = if caller.is_known() {

@@ -90,9 +90,12 @@ fn interface(of: &recorded::Interface) -> Interface {
             .iter()
             .map(|parameter| api::interface::Parameter {
                 name: parameter.name.clone(),
+                node: Some(parameter.node.clone()).filter(|node| !node.is_empty()),
                 value: parameter.value.clone(),
+                descriptor: parameter.descriptor.as_ref().map(descriptor),
             })
             .collect(),
+        lifecycle: of.lifecycle.clone(),
         needs: of
             .needs
             .iter()
@@ -115,6 +118,44 @@ fn topic(of: &recorded::Topic) -> api::interface::Topic {
         },
         latched: of.latched,
         lazy: of.lazy,
+        qos: of.qos.as_ref().map(qos),
+    }
+}
+
+fn qos(of: &recorded::Qos) -> api::interface::Qos {
+    use api::interface::{Durability, Liveliness, Reliability};
+    api::interface::Qos {
+        reliability: match of.reliability {
+            recorded::Reliability::BestEffort => Reliability::BestEffort,
+            recorded::Reliability::Reliable => Reliability::Reliable,
+        },
+        durability: match of.durability {
+            recorded::Durability::Volatile => Durability::Volatile,
+            recorded::Durability::TransientLocal => Durability::TransientLocal,
+        },
+        deadline: of.deadline,
+        lifespan: of.lifespan,
+        liveliness: match of.liveliness {
+            recorded::Liveliness::Automatic => Liveliness::Automatic,
+            recorded::Liveliness::ManualByTopic => Liveliness::ManualByTopic,
+        },
+        lease: of.lease,
+    }
+}
+
+fn descriptor(of: &recorded::Descriptor) -> api::interface::Descriptor {
+    let number = |number: &Option<serde_json::Number>| number.as_ref()?.as_f64();
+    api::interface::Descriptor {
+        kind: of.kind.clone(),
+        description: of.description.clone(),
+        constraints: of.constraints.clone(),
+        read_only: of.read_only,
+        dynamic_typing: of.dynamic_typing,
+        range: of.range.as_ref().map(|range| api::interface::Range {
+            from: number(&range.from),
+            to: number(&range.to),
+            step: number(&range.step),
+        }),
     }
 }
 

@@ -56,6 +56,7 @@ mod tests {
             nodes: Vec::new(),
             latched: false,
             lazy: false,
+            qos: None,
         };
         let interface = |topics| Interface {
             topics,

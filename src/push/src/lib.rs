@@ -254,6 +254,9 @@ impl Pusher {
         report: &Reporter,
     ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
+        if plan.shared.is_some() {
+            shared::check_ros(built.flavour.ros.bus())?;
+        }
         report.step("starting it once to find its interface").await;
         for warning in self.choreographer.check_grants(&plan.grants)? {
             report.warning(warning).await;
@@ -264,7 +267,8 @@ impl Pusher {
         }
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
-            supplement::add(&mut interface, text, &built.inventory.definitions)
+            let known = (built.flavour.ros.bus(), &built.inventory.definitions);
+            supplement::add(&mut interface, text, known)
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         interface_limits::check_interface(&interface)?;

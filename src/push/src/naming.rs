@@ -15,6 +15,7 @@ use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::ProbeError;
 use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
+use ros::plumbing;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
 use tokio::time::timeout;
@@ -23,6 +24,9 @@ use super::Pusher;
 use super::probe::{self, Alive, NODE};
 use crate::Error;
 use store::Plan;
+
+/// Parameters that a warning names.
+const NAMED: usize = 12;
 
 /// Where the node of an index is while its name is looked for.
 fn namespace(index: usize) -> String {
@@ -260,8 +264,45 @@ pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) 
                 names.join(", ")
             ));
         }
+        if let Some(has) = undeclared(interface, key) {
+            warnings.push(format!(
+                "no node has declared a parameter {key}, so that it is without effect; {has}"
+            ));
+        }
     }
     warnings
+}
+
+/// Where nodes have parameters of their own (ROS 2) and none has one of this name: those that there are, in words.
+fn undeclared(interface: &Interface, key: &str) -> Option<String> {
+    let own: Vec<_> = interface
+        .parameters
+        .iter()
+        .filter(|parameter| parameter.own_name().is_some())
+        .collect();
+    // A level of names is a dot there; `/rate` is everybody's.
+    let wanted = key.trim_start_matches(['~', '_']);
+    let is_it = |parameter: &&&package::interface::Parameter| {
+        let name = parameter.own_name().unwrap_or_default();
+        let below = |whole: &str| {
+            let whole = whole.replace('/', ".");
+            name == whole
+                || name
+                    .strip_prefix(&whole)
+                    .is_some_and(|rest| rest.starts_with('.'))
+        };
+        match wanted.strip_prefix(&parameter.node) {
+            Some(rest) if rest.starts_with('/') => below(&rest[1..]),
+            _ => below(wanted.trim_start_matches('/')),
+        }
+    };
+    let last = wanted.rsplit('/').next().unwrap_or_default();
+    if own.is_empty() || plumbing::parameter(last) || own.iter().any(|it| is_it(&it)) {
+        return None;
+    }
+    let mut names: Vec<&str> = own.iter().map(|it| it.name.as_str()).collect();
+    names.truncate(NAMED);
+    Some(format!("there are {}", names.join(", ")))
 }
 
 #[cfg(test)]
@@ -318,13 +359,43 @@ mod tests {
         let interface = Interface {
             parameters: vec![Parameter {
                 name: "/costmap_2d_node/stays".to_owned(),
-                value: None,
                 read_by: vec!["/other".to_owned()],
-                written_by: Vec::new(),
+                ..Parameter::default()
             }],
             ..Interface::default()
         };
         assert!(unused(&plan, &interface, &options).is_empty());
+    }
+
+    #[test]
+    fn parameters_that_no_node_of_ros_2_has_declared_are_told() {
+        let own = |name: &str| Parameter {
+            name: format!("/see/{name}"),
+            node: "/see".to_owned(),
+            ..Parameter::default()
+        };
+        let interface = Interface {
+            parameters: vec![own("rate"), own("camera.width")],
+            ..Interface::default()
+        };
+        for known in [
+            "rate",
+            "~rate",
+            "/rate",
+            "/see/rate",
+            "/see/camera/width",
+            "camera/width",
+            "camera",
+            "use_sim_time",
+        ] {
+            assert_eq!(undeclared(&interface, known), None, "{known}");
+        }
+        for unknown in ["rat", "/see/rat", "/other/rate/x", "width"] {
+            let words = undeclared(&interface, unknown).expect(unknown);
+            assert_eq!(words, "there are /see/rate, /see/camera.width");
+        }
+        // Nodes of ROS 1 declare nothing.
+        assert_eq!(undeclared(&Interface::default(), "rat"), None);
     }
 
     #[test]

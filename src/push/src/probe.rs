@@ -180,7 +180,7 @@ async fn look(
             }
         };
         rootfs_builder::probe::probe(
-            &*looked.bus,
+            &looked.bus,
             &registry,
             &built.inventory.definitions,
             &options,

@@ -70,6 +70,7 @@ mod tests {
             nodes: Vec::new(),
             latched,
             lazy: false,
+            qos: None,
         }
     }
 

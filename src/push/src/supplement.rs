@@ -15,6 +15,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use package::interface::Interface;
+use package::names;
+use ros::bus::RosVersion;
 use ros::schema::{Base, MessageType, Registry, SchemaError};
 
 /// Why a supplement is refused.
@@ -43,10 +45,10 @@ pub(super) enum SupplementError {
 pub(super) fn add(
     interface: &mut Interface,
     text: &str,
-    definitions: &BTreeMap<String, String>,
+    (ros, definitions): (RosVersion, &BTreeMap<String, String>),
 ) -> Result<(), SupplementError> {
     let mut stated = read(text)?;
-    let registry = Registry::from_definitions(definitions).map_err(unknown("the image"))?;
+    let registry = Registry::of_definitions(ros, definitions).map_err(unknown("the image"))?;
     let mut texts = Texts {
         definitions,
         used: BTreeMap::new(),
@@ -57,7 +59,9 @@ pub(super) fn add(
             .message(&topic.type_name)
             .map_err(unknown(&topic.name))?;
         texts.message(&message);
-        topic.md5 = message.md5().to_owned();
+        // A type may be stated with its kind or without; each ROS has one way to write it.
+        topic.type_name = message.name().to_owned();
+        topic.md5 = message.digest().to_owned();
     }
     for service in &mut stated.services {
         absolute(&service.name)?;
@@ -67,9 +71,10 @@ pub(super) fn add(
         texts.own(&service.type_name, "srv");
         texts.message(&definition.request);
         texts.message(&definition.response);
+        service.type_name.clone_from(&definition.name);
         service.md5.clone_from(&definition.md5);
     }
-    for action in &stated.actions {
+    for action in &mut stated.actions {
         absolute(&action.name)?;
         let definition = registry
             .action(&action.type_name)
@@ -78,6 +83,7 @@ pub(super) fn add(
         for message in [&definition.goal, &definition.result, &definition.feedback] {
             texts.message(message);
         }
+        action.type_name.clone_from(&definition.name);
     }
     for parameter in &stated.parameters {
         absolute(&parameter.name)?;
@@ -124,7 +130,7 @@ struct Texts<'a> {
 
 impl Texts<'_> {
     fn own(&mut self, type_name: &str, kind: &str) -> bool {
-        let key = type_name.replacen('/', &format!("/{kind}/"), 1);
+        let key = names::key(type_name, kind);
         match self.definitions.get(&key) {
             Some(text) => self.used.insert(key, text.clone()).is_none(),
             None => false,
@@ -161,7 +167,7 @@ mod tests {
         let mut interface = Interface::default();
         let text = "[[topics]]\nname = \"/out\"\ntype = \"a/Outer\"\ndirection = \"output\"\n\
                     [[services]]\nname = \"/ask\"\ntype = \"a/Ask\"\n";
-        add(&mut interface, text, &definitions()).expect("valid");
+        add(&mut interface, text, (RosVersion::One, &definitions())).expect("valid");
         assert_eq!(interface.topics[0].name, "/out");
         assert_eq!(interface.topics[0].md5.len(), 32);
         assert_eq!(interface.services[0].type_name, "a/Ask");
@@ -170,15 +176,36 @@ mod tests {
     }
 
     #[test]
+    fn types_of_ros_2_are_stated_with_their_kind_or_without() {
+        let text = "[[topics]]\nname = \"/out\"\ntype = \"a/Outer\"\ndirection = \"output\"\n\
+                    [[services]]\nname = \"/ask\"\ntype = \"a/srv/Ask\"\n\
+                    [[actions]]\nname = \"/go\"\ntype = \"a/Go\"\n";
+        let mut definitions = definitions();
+        let go = "Inner to\n---\n---\n".to_owned();
+        definitions.insert("a/action/Go".to_owned(), go);
+        let mut interface = Interface::default();
+        add(&mut interface, text, (RosVersion::Two, &definitions)).expect("valid");
+        assert_eq!(interface.topics[0].type_name, "a/msg/Outer");
+        assert!(interface.topics[0].md5.starts_with("RIHS01_"));
+        assert_eq!(interface.services[0].type_name, "a/srv/Ask");
+        assert_eq!(interface.actions[0].type_name, "a/action/Go");
+        let keys: Vec<&str> = interface.definitions.keys().map(String::as_str).collect();
+        assert_eq!(
+            keys,
+            ["a/action/Go", "a/msg/Inner", "a/msg/Outer", "a/srv/Ask"]
+        );
+    }
+
+    #[test]
     fn json_is_read_too_and_what_was_found_stays() {
         let mut interface = Interface::default();
         let text = r#"{"topics": [{"name": "/out", "type": "a/Inner", "direction": "output", "latched": true}]}"#;
-        add(&mut interface, text, &definitions()).expect("valid");
+        add(&mut interface, text, (RosVersion::One, &definitions())).expect("valid");
         let before = interface.clone();
         add(
             &mut interface,
             &text.replace("true", "false"),
-            &definitions(),
+            (RosVersion::One, &definitions()),
         )
         .expect("valid");
         assert_eq!(interface, before);
@@ -198,9 +225,13 @@ mod tests {
             ("[[topics]]\nname = \"/out\"\ntyp = \"a/Inner\"", "typ"),
             ("{", "EOF"),
         ] {
-            let refused = add(&mut Interface::default(), text, &definitions())
-                .expect_err(words)
-                .to_string();
+            let refused = add(
+                &mut Interface::default(),
+                text,
+                (RosVersion::One, &definitions()),
+            )
+            .expect_err(words)
+            .to_string();
             assert!(refused.contains(words), "{refused}");
         }
     }

@@ -1,7 +1,8 @@
-//! MCAP files (<https://mcap.dev/spec>) of messages of ROS 1, as the bytes that they are.
+//! MCAP files (<https://mcap.dev/spec>) of messages of ROS 1 or of ROS 2, as the bytes that they are.
 
 #![deny(unsafe_code)]
 
+mod format;
 mod reader;
 mod writer;
 
@@ -10,6 +11,7 @@ use std::path::PathBuf;
 
 use mcap::McapError;
 
+pub use format::Format;
 pub use reader::{Played, Reader};
 pub use writer::{Summary, TopicSummary, Writer};
 

@@ -9,11 +9,12 @@ use mcap::records::MessageHeader;
 use mcap::{McapError, WriteOptions};
 use serde::Serialize;
 
-use crate::Error;
+use crate::{Error, Format};
 
 /// A file that is being written.
 pub struct Writer {
     path: PathBuf,
+    format: Format,
     /// The same file, to be asked how large it is: who writes it may not be allowed to look into its directory.
     asked: File,
     file: mcap::Writer<Whole>,
@@ -64,31 +65,32 @@ impl Writer {
     ///
     /// # Errors
     /// [`Error::NotMade`], [`Error::Unwritable`].
-    pub fn create(path: &Path) -> Result<Self, Error> {
+    pub fn create(path: &Path, format: Format) -> Result<Self, Error> {
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(path);
         let file = file.map_err(|reason| Error::NotMade {
             path: path.to_owned(),
             reason,
         })?;
-        Self::of(path, file)
+        Self::of(path, file, format)
     }
 
     /// Writes into `file`, which is empty, and is at `path`.
     ///
     /// # Errors
     /// [`Error::Unwritable`].
-    pub fn of(path: &Path, file: File) -> Result<Self, Error> {
+    pub fn of(path: &Path, file: File, format: Format) -> Result<Self, Error> {
         let asked = file.try_clone().map_err(|reason| Error::NotMade {
             path: path.to_owned(),
             reason,
         })?;
         let options = WriteOptions::new()
-            .profile("ros1")
+            .profile(format.profile())
             .library(concat!("cloudroid ", env!("CARGO_PKG_VERSION")));
         let file = options.create(Whole::of(file)).map_err(unwritable(path))?;
         Ok(Self {
             path: path.to_owned(),
+            format,
             asked,
             file,
             topics: BTreeMap::new(),
@@ -101,11 +103,12 @@ impl Writer {
     /// # Errors
     /// [`Error::Unwritable`], as of what follows.
     pub fn channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> Result<u16, Error> {
-        let schema = self.file.add_schema(of, "ros1msg", definition);
+        let schema = self.file.add_schema(of, self.format.schema(), definition);
         let schema = schema.map_err(unwritable(&self.path))?;
+        let encoding = self.format.encoding();
         let channel = self
             .file
-            .add_channel(schema, topic, "ros1", &BTreeMap::new());
+            .add_channel(schema, topic, encoding, &BTreeMap::new());
         let channel = channel.map_err(unwritable(&self.path))?;
         self.topics.entry(channel).or_insert_with(|| Topic {
             name: topic.to_owned(),
@@ -237,10 +240,43 @@ mod tests {
     use crate::Reader;
 
     #[test]
+    fn a_file_of_ros_2_says_so() {
+        let place = tempfile::tempdir().expect("a directory");
+        let path = place.path().join("two.mcap");
+        let mut writer = Writer::create(&path, Format::Ros2).expect("a new file");
+        let channel = writer.channel("/chatter", "std_msgs/msg/String", b"string data");
+        let message = [0, 1, 0, 0, 2, 0, 0, 0, b'a', 0];
+        writer
+            .add(channel.expect("a channel"), 7, &message)
+            .expect("is written");
+        writer.finish().expect("an end");
+        let bytes = std::fs::read(&path).expect("it is there");
+        // Magic, opcode and length of the header, and its first text.
+        assert_eq!(&bytes[17..25], b"\x04\0\0\0ros2");
+        let summary = mcap::Summary::read(&bytes)
+            .expect("it is whole")
+            .expect("a summary");
+        let channel = summary.channels.values().next().expect("a channel");
+        assert_eq!(channel.message_encoding, "cdr");
+        let schema = channel.schema.as_ref().expect("a schema");
+        assert_eq!(
+            (&*schema.name, &*schema.encoding),
+            ("std_msgs/msg/String", "ros2msg")
+        );
+        let mut reader = Reader::open(&path).expect("it opens");
+        let played = reader
+            .next_message()
+            .expect("it is read")
+            .expect("a message");
+        assert_eq!(Format::of_encoding(&played.encoding), Some(Format::Ros2));
+        assert_eq!((played.time, &*played.message), (7, &message[..]));
+    }
+
+    #[test]
     fn what_is_written_is_read_and_a_file_that_breaks_off_up_to_there() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("x.mcap");
-        let mut writer = Writer::create(&path).expect("a new file");
+        let mut writer = Writer::create(&path, Format::Ros1).expect("a new file");
         let text = writer.channel("/chatter", "std_msgs/String", b"string data");
         let text = text.expect("a channel");
         let same = writer.channel("/chatter", "std_msgs/String", b"string data");
@@ -286,7 +322,9 @@ mod tests {
             assert!(breaks_off && all.starts_with(&found), "cut at {end}");
         }
 
-        let error = Writer::create(&path).err().expect("it is there");
+        let error = Writer::create(&path, Format::Ros1)
+            .err()
+            .expect("it is there");
         assert!(error.to_string().contains("exists"), "{error}");
     }
 }

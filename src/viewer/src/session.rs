@@ -32,6 +32,7 @@ use tokio::time::timeout;
 use ws::WebSocket;
 
 use crate::catalogue::Catalogue;
+use crate::format::Format;
 use crate::line::{Frame, Line, Read};
 use crate::parameters;
 
@@ -39,9 +40,6 @@ use crate::parameters;
 /// part of the SDK.
 pub const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
-/// How messages are written, and how their definitions are.
-const ENCODING: &str = "ros1";
-const SCHEMA: &str = "ros1msg";
 /// Bytes of a message in JSON: many small things, of which each may have an answer. Publications are binary.
 const LARGEST_TEXT: usize = 1 << 20;
 /// What waits to be sent, in messages; a viewer that reads slowly misses what comes meanwhile.
@@ -118,6 +116,7 @@ pub async fn serve<S>(
     let mut graph = bus.graph();
     graph.mark_changed();
     let mut session = Session {
+        format: Format::of(bus.version()),
         bus,
         registry,
         granted: options.granted,
@@ -223,6 +222,8 @@ enum Ended {
 
 struct Session {
     bus: Arc<dyn Bus>,
+    /// How messages are written, and how their definitions are.
+    format: Format,
     registry: Arc<Registry>,
     granted: Granted,
     catalogue: Catalogue,
@@ -277,7 +278,7 @@ impl Session {
                 Capability::Services,
                 Capability::ConnectionGraph,
             ])
-            .with_supported_encodings([ENCODING]);
+            .with_supported_encodings([self.format.encoding]);
         self.tell(&info);
     }
 
@@ -351,8 +352,9 @@ impl Session {
                 let Some(id) = self.catalogue.add_topic(&topic, Arc::clone(&of)) else {
                     return;
                 };
-                let schema = Schema::new(&of.name, SCHEMA, of.definition.as_bytes());
-                let channel = Channel::builder(id, &topic, ENCODING).with_schema(schema);
+                let (encoding, kind) = (self.format.encoding, self.format.schema);
+                let schema = Schema::new(&of.name, kind, of.definition.as_bytes());
+                let channel = Channel::builder(id, &topic, encoding).with_schema(schema);
                 if let Ok(channel) = channel.build() {
                     self.tell(&Advertise::new([channel]));
                 }
@@ -361,14 +363,15 @@ impl Session {
                 let Some(id) = self.catalogue.add_service(&service, Arc::clone(&of)) else {
                     return;
                 };
+                let (encoding, kind) = (self.format.encoding, self.format.schema);
                 let schema = |name: &str, text: &str| {
-                    Schema::new(name.to_owned(), SCHEMA, text.as_bytes().to_vec())
+                    Schema::new(name.to_owned(), kind, text.as_bytes().to_vec())
                 };
                 let (request, response) = (&of.request, &of.response);
                 let told = Service::new(id, &service, &of.name)
-                    .with_request(ENCODING, schema(request.name(), request.full_text()))
+                    .with_request(encoding, schema(request.name(), request.full_text()))
                     .and_then(|told| {
-                        told.with_response(ENCODING, schema(response.name(), response.full_text()))
+                        told.with_response(encoding, schema(response.name(), response.full_text()))
                     });
                 if let Ok(told) = told {
                     self.tell(&AdvertiseServices::new([told]));
@@ -557,9 +560,10 @@ impl Session {
         topic: &str,
         channel: &client::advertise::Channel<'_>,
     ) -> Result<(Arc<MessageType>, Box<dyn Publisher>), String> {
-        if channel.encoding != ENCODING {
+        let encoding = self.format.encoding;
+        if channel.encoding != encoding {
             return Err(format!(
-                "{topic}: messages are to be written as {ENCODING}, not {}",
+                "{topic}: messages are to be written as {encoding}, not {}",
                 channel.encoding
             ));
         }
@@ -604,6 +608,7 @@ impl Session {
         };
         self.calls += 1;
         let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
+        let encoding = self.format.encoding;
         let request = Bytes::copy_from_slice(&call.payload);
         self.tasks.spawn(async move {
             let digest = of.md5.as_str().into();
@@ -613,7 +618,7 @@ impl Session {
                     let response = ServiceCallResponse {
                         service_id,
                         call_id,
-                        encoding: ENCODING.into(),
+                        encoding: encoding.into(),
                         payload: (&answer[..]).into(),
                     };
                     Frame::Binary(response.to_bytes().into())
@@ -636,9 +641,10 @@ impl Session {
         let found = self.catalogue.service(call.service_id);
         let (service, of) =
             found.ok_or_else(|| format!("there is no service {}", call.service_id))?;
-        if call.encoding != ENCODING {
+        let encoding = self.format.encoding;
+        if call.encoding != encoding {
             return Err(format!(
-                "{service}: requests are to be written as {ENCODING}, not {}",
+                "{service}: requests are to be written as {encoding}, not {}",
                 call.encoding
             ));
         }
@@ -655,22 +661,7 @@ impl Session {
 
     /// All of them where none is named.
     async fn tell_parameters(&mut self, names: Vec<String>, id: Option<String>) {
-        let bus = &self.bus;
-        let read = async {
-            let parameters = bus.parameters()?;
-            let names = match names.is_empty() {
-                true => parameters.names().await?,
-                false => names,
-            };
-            let mut values = Vec::new();
-            for name in names {
-                if let Ok(value) = parameters.get(&name).await {
-                    values.extend(parameters::told(&name, &value));
-                }
-            }
-            Ok::<_, ros::bus::BusError>(values)
-        };
-        match read.await {
+        match parameters::all(&*self.bus, names).await {
             Ok(values) => {
                 let told = ParameterValues::new(values);
                 let told = match id {
@@ -689,14 +680,7 @@ impl Session {
         }
         let mut names = Vec::new();
         for one in wanted.parameters {
-            let done = async {
-                let parameters = self.bus.parameters()?;
-                match one.value {
-                    Some(value) => parameters.set(&one.name, parameters::read(value)).await,
-                    None => parameters.delete(&one.name).await,
-                }
-            };
-            if let Err(error) = done.await {
+            if let Err(error) = parameters::set(&*self.bus, &one.name, one.value).await {
                 self.complain(format!("{} cannot be set: {error}", one.name));
             }
             names.push(one.name);

@@ -70,7 +70,9 @@ export interface ServiceSummary {
   limits: Limits;
 }
 
-export interface Topic { name: string; type: string; direction: 'input' | 'output'; latched: boolean; lazy: boolean }
+export interface Qos { reliability: string; durability: string; liveliness: string; deadline?: number; lifespan?: number; lease?: number }
+export interface Topic { name: string; type: string; direction: 'input' | 'output'; latched: boolean; lazy: boolean; qos?: Qos }
+export interface Descriptor { type: string; description: string; constraints: string; read_only: boolean; range?: { from?: number; to?: number; step?: number } }
 export interface Typed { name: string; type: string; node?: string }
 
 export interface ServiceDetail extends ServiceSummary {
@@ -80,7 +82,8 @@ export interface ServiceDetail extends ServiceSummary {
     topics: Topic[];
     services: Typed[];
     actions: Typed[];
-    parameters: { name: string; value?: unknown }[];
+    parameters: { name: string; value?: unknown; descriptor?: Descriptor }[];
+    lifecycle: string[];
     needs: { name: string; nodes: string[] }[];
   };
 }
@@ -108,6 +111,7 @@ export interface Servant {
   drops?: { topic: string; count: number }[];
   down: { node: string; failures: number; again: number }[];
   hung: string[];
+  lifecycle: { node: string; state: string; refused?: string }[];
 }
 
 export interface Part { name: string; p50: number; p90: number; max: number }

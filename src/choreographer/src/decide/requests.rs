@@ -2,13 +2,14 @@
 
 use package::interface::{Direction, Interface, Topic};
 use qos::{Correlation, Pair};
+use ros::bus::RosVersion;
 use ros::schema::Registry;
 
 /// The input whose messages are requests and the outputs that answer them, where the interface has one such pair and leaves
 /// no doubt which. By stamps there is none. Where the next output would be the answer, there has to be one input and one
 /// output, and nothing else to ask: what a node publishes at its own pace would be taken for an answer.
-pub fn asked_by_topic(interface: &Interface) -> Option<Pair> {
-    let registry = Registry::new();
+pub fn asked_by_topic(ros: RosVersion, interface: &Interface) -> Option<Pair> {
+    let registry = Registry::of(ros);
     for (key, text) in &interface.definitions {
         // Of a type that is not usable no message is recognised.
         let _ = registry.insert(key, text);
@@ -78,6 +79,15 @@ mod tests {
     }
 
     #[test]
+    fn stamps_of_ros_2_are_recognised() {
+        let mut two = interface(&["</in x/msg/Stamped", ">/out x/msg/Stamped"], &["/ask"]);
+        let header = "builtin_interfaces/Time stamp\nstring frame_id\n".to_owned();
+        two.definitions.insert("std_msgs/msg/Header".into(), header);
+        let found = asked_by_topic(RosVersion::Two, &two).map(|pair| pair.to_string());
+        assert_eq!(found.as_deref(), Some("/in -> /out by stamp"));
+    }
+
+    #[test]
     fn what_leaves_no_doubt_is_a_pair() {
         for (topics, services, expected) in [
             (
@@ -122,7 +132,7 @@ mod tests {
             (&["</in x/Missing", ">/out x/Text"], &[], ""),
             (&[], &["/ask"], ""),
         ] {
-            let found = asked_by_topic(&interface(topics, services));
+            let found = asked_by_topic(RosVersion::One, &interface(topics, services));
             let words = found.map(|pair| pair.to_string()).unwrap_or_default();
             assert_eq!(words, expected, "{topics:?} {services:?}");
         }

@@ -75,7 +75,7 @@ impl Choreographer {
     ) -> Result<Calibration, Error> {
         let revision = self.inner.catalogue.current(service)?;
         reach::fits(
-            service,
+            (service, revision.flavour.ros.bus()),
             &revision.interface,
             &requests.material,
             options.input.as_deref(),

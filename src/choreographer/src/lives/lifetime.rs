@@ -5,7 +5,9 @@ use std::sync::Arc;
 use api::Phase;
 use package::interface::Interface;
 use reach::Reach;
+use reach::lifecycle::Stages;
 use reach::readiness::{missing, missing_nodes};
+use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
 use super::Inner;
@@ -24,9 +26,13 @@ pub(super) async fn interface_there(
     let interface: &Interface = &handle.revision.interface;
     let image = &handle.revision.image;
     let mut graphs = reach.graph();
+    let mut lifecycles = reach.lifecycles();
     let mut changed = Instant::now();
     loop {
         let graph = graphs.borrow_and_update().clone();
+        if let Some(refused) = lifecycles.as_mut().and_then(refused) {
+            return Err(Failure::broken(format!("is of no use: {refused}")));
+        }
         let missing = missing(interface, &graph);
         let nodes_missing = missing_nodes(interface, &graph);
         let shown = Shown {
@@ -52,11 +58,31 @@ pub(super) async fn interface_there(
             }
             Readiness::Late(reason) => return Err(Failure::broken(reason)),
         };
-        match timeout_at(until, graphs.changed()).await {
-            Ok(Ok(())) => changed = Instant::now(),
-            Ok(Err(_)) => return Err(Failure::broken("lost its ROS Master")),
-            Err(_) => {}
+        tokio::select! {
+            shown = timeout_at(until, graphs.changed()) => match shown {
+                Ok(Ok(())) => changed = Instant::now(),
+                Ok(Err(_)) => return Err(Failure::broken("lost its ROS")),
+                Err(_) => {}
+            },
+            // A node that becomes active is about to show more.
+            () = stage_changed(&mut lifecycles) => changed = Instant::now(),
         }
+    }
+}
+
+/// Why a node with a lifecycle does not do its work, if one does not.
+fn refused(stages: &mut watch::Receiver<Stages>) -> Option<String> {
+    let stages = stages.borrow_and_update();
+    stages.values().find_map(|stage| stage.refused.clone())
+}
+
+async fn stage_changed(stages: &mut Option<watch::Receiver<Stages>>) {
+    let changed = match stages {
+        Some(stages) => stages.changed().await,
+        None => return std::future::pending().await,
+    };
+    if changed.is_err() {
+        *stages = None;
     }
 }
 

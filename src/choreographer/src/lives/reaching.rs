@@ -50,9 +50,10 @@ pub(crate) fn habits(
     let measures = Measures::of(inner, revision, id);
     let options = ReachOptions {
         ros: revision.flavour.ros.bus(),
+        distribution: revision.flavour.distribution.clone(),
         bridge: BridgeOptions {
             called: measures.called(),
-            pair: asked_by_topic(&revision.interface),
+            pair: asked_by_topic(revision.flavour.ros.bus(), &revision.interface),
             ..inner.options.bridge.clone()
         },
         grace: inner.options.grace,

@@ -81,7 +81,7 @@ fn could_not_start(error: Error) -> Failure {
     Failure::broken(format!("could not be started: {error}"))
 }
 
-/// Reaches the ROS Master in the container and sets a bridge before it.
+/// Reaches the ROS in the container and sets a bridge before it.
 pub(super) async fn reach(
     inner: &Arc<Inner>,
     handle: &Arc<Handle>,
@@ -90,7 +90,9 @@ pub(super) async fn reach(
 ) -> Result<Arc<dyn Reach>, Failure> {
     let late = |_| {
         let limit = inner.options.start.as_secs();
-        Failure::broken(format!("did not start its ROS Master within {limit} s"))
+        Failure::broken(format!(
+            "could not be reached within {limit} s: its ROS did not come up"
+        ))
     };
     timeout_at(deadline, reaching::open(inner, &handle.revision, container))
         .await

@@ -18,7 +18,7 @@ use ros::schema::Registry;
 use tokio::time::{Instant, timeout_at};
 
 use crate::client::{Client, escaped};
-use crate::inside::{self, ENCODING, Inside};
+use crate::inside::{self, Inside};
 use crate::output;
 
 /// So much of a recording is used, as by the daemon.
@@ -306,8 +306,10 @@ impl Line<'_> {
             self.heard(deadline).await?;
         }
         for (number, input) in (0..).zip(&calibration.inputs) {
-            let schema = Schema::new(&*input.type_name, "ros1msg", &b""[..]);
-            let told = Channel::builder(number, &*input.topic, ENCODING).with_schema(schema);
+            let format = self.inside.format;
+            let schema = Schema::new(&*input.type_name, format.schema(), &b""[..]);
+            let told = Channel::builder(number, &*input.topic, format.encoding());
+            let told = told.with_schema(schema);
             self.inside.send(&Advertise::new([told.build()?])).await?;
         }
         Ok(())

@@ -328,9 +328,6 @@ fn next_of_catalogue(error: &catalogue::Error) -> String {
             format!("see those that exist with: cloudroidctl services {service}")
         }
         C::NoStub { service, .. } => format!("fix the package and push {service} again"),
-        C::StubOfRos2 { service } => {
-            format!("use it by rosbridge, at /{service} of this server's address for WebSockets")
-        }
         C::UnknownArchitecture { .. } => {
             "ask for one that it holds with ?arch=, or have its operator add the others: make stub-cross".to_owned()
         }

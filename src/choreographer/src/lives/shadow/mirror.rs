@@ -111,7 +111,8 @@ impl<'a> Mirror<'a> {
             None => None,
         };
         let definitions = &revision.interface.definitions;
-        let registry = Registry::from_definitions(definitions).map_err(|error| {
+        let ros = revision.flavour.ros.bus();
+        let registry = Registry::of_definitions(ros, definitions).map_err(|error| {
             Error::Shadow(format!("a definition of {}: {error}", revision.service))
         })?;
         let registry = Arc::new(registry);

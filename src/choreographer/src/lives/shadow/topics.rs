@@ -181,7 +181,8 @@ impl Topics {
             .collect();
         let mut wanted = Vec::new();
         for (name, ends) in &graph.topics {
-            if name.starts_with("/rosout") || of_actions.contains(&name) {
+            let of_ros = name.starts_with("/rosout") || name == "/parameter_events";
+            if of_ros || of_actions.contains(&name) {
                 continue;
             }
             let made_there = ends.publishers.iter().any(own);

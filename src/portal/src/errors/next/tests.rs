@@ -265,7 +265,6 @@ fn of_what_is_kept() -> Vec<Error> {
             service: x(),
             reason: x(),
         },
-        K::StubOfRos2 { service: x() },
         K::UnknownArchitecture {
             asked: x(),
             exists: Vec::new(),

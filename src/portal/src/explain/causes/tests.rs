@@ -30,6 +30,7 @@ fn served(link: Link) -> Served {
             drops: Vec::new(),
             down: Vec::new(),
             hung: Vec::new(),
+            lifecycle: Vec::new(),
         },
         throttled: 0.0,
         cores: 0.0,

@@ -94,6 +94,11 @@ fn servant() -> Servant {
             count: 1,
         }],
         hung: vec!["/x answered none of 3 inputs in 1.0 s".into()],
+        lifecycle: vec![api::NodeStage {
+            node: "/x".into(),
+            state: "inactive".into(),
+            refused: Some("it did not activate".into()),
+        }],
         down: vec![NodeDown {
             node: "/x".into(),
             failures: 2,
@@ -282,6 +287,12 @@ fn detail() -> ServiceDetail {
                 direction: Direction::Input,
                 latched: false,
                 lazy: true,
+                qos: Some(api::interface::Qos {
+                    deadline: Some(0.5),
+                    lifespan: Some(1.5),
+                    lease: Some(2.5),
+                    ..api::interface::Qos::default()
+                }),
             }],
             services: vec![Service {
                 name: name.clone(),
@@ -295,8 +306,18 @@ fn detail() -> ServiceDetail {
             }],
             parameters: vec![Parameter {
                 name: name.clone(),
+                node: Some("/x".into()),
                 value: Some(Value::from(1)),
+                descriptor: Some(api::interface::Descriptor {
+                    range: Some(api::interface::Range {
+                        from: Some(0.5),
+                        to: Some(1.5),
+                        step: Some(0.5),
+                    }),
+                    ..api::interface::Descriptor::default()
+                }),
             }],
+            lifecycle: all("/n"),
             needs: vec![Need {
                 name,
                 nodes: all("/n"),

@@ -1,0 +1,140 @@
+//! What a node says of its parameters, where nodes have them (ROS 2).
+
+use ros::bus::{ParameterDescription, ParameterKind};
+use serde::{Deserialize, Serialize};
+use serde_json::Number;
+
+/// What a node says of one of its parameters.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Descriptor {
+    /// What it holds: `bool`, `integer`, `double`, `string`, or a list of them, `byte_array` among those; empty where it
+    /// holds nothing yet.
+    #[serde(rename = "type", skip_serializing_if = "String::is_empty")]
+    pub kind: String,
+    /// For people.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub description: String,
+    /// What else its value must be, for people.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub constraints: String,
+    /// It keeps the value that it was started with.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub read_only: bool,
+    /// It may come to hold what is of another type.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub dynamic_typing: bool,
+    /// Between which numbers its value is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub range: Option<Range>,
+}
+
+/// The numbers that a parameter may hold, the ends included: whole ones of an integer.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Range {
+    /// The smallest; none where there is no bound.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from: Option<Number>,
+    /// The largest; none where there is no bound.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub to: Option<Number>,
+    /// The distance of one to the next, counted from the smallest; none where all between the ends will do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub step: Option<Number>,
+}
+
+/// Texts longer than this are cut: they are told to every client.
+const LONGEST_TEXT: usize = 2000;
+
+impl From<ParameterDescription> for Descriptor {
+    fn from(said: ParameterDescription) -> Self {
+        let doubles = said.double_range.map(|range| Range {
+            from: Number::from_f64(range.from),
+            to: Number::from_f64(range.to),
+            step: Number::from_f64(range.step).filter(|_| range.step != 0.0),
+        });
+        let integers = said.integer_range.map(|range| Range {
+            from: Some(range.from.into()),
+            to: Some(range.to.into()),
+            // TOML's integers are signed.
+            step: i64::try_from(range.step)
+                .ok()
+                .filter(|step| *step != 0)
+                .map(Number::from),
+        });
+        Self {
+            kind: word(said.kind).to_owned(),
+            description: shortened(said.description),
+            constraints: shortened(said.constraints),
+            read_only: said.read_only,
+            dynamic_typing: said.dynamic_typing,
+            range: match said.kind {
+                ParameterKind::Double | ParameterKind::Doubles => doubles.or(integers),
+                _ => integers.or(doubles),
+            },
+        }
+    }
+}
+
+/// As ROS 2's tools call it.
+fn word(kind: ParameterKind) -> &'static str {
+    match kind {
+        ParameterKind::NotSet => "",
+        ParameterKind::Bool => "bool",
+        ParameterKind::Integer => "integer",
+        ParameterKind::Double => "double",
+        ParameterKind::String => "string",
+        ParameterKind::Bytes => "byte_array",
+        ParameterKind::Bools => "bool_array",
+        ParameterKind::Integers => "integer_array",
+        ParameterKind::Doubles => "double_array",
+        ParameterKind::Strings => "string_array",
+    }
+}
+
+fn shortened(text: String) -> String {
+    match text.char_indices().nth(LONGEST_TEXT) {
+        Some((end, _)) => format!("{}…", &text[..end]),
+        None => text,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::bus::{DoubleRange, IntegerRange};
+
+    use super::*;
+
+    #[test]
+    fn what_a_node_says_is_kept_as_json_and_toml_can_hold_it() {
+        let open = Descriptor::from(ParameterDescription {
+            kind: ParameterKind::Double,
+            description: "m/s".to_owned(),
+            double_range: Some(DoubleRange {
+                from: 0.0,
+                to: f64::INFINITY,
+                step: 0.0,
+            }),
+            ..ParameterDescription::default()
+        });
+        assert_eq!(
+            serde_json::to_value(&open).expect("JSON"),
+            serde_json::json!({"type": "double", "description": "m/s", "range": {"from": 0.0}})
+        );
+        let whole = Descriptor::from(ParameterDescription {
+            kind: ParameterKind::Integer,
+            read_only: true,
+            integer_range: Some(IntegerRange {
+                from: -1,
+                to: 9,
+                step: u64::MAX,
+            }),
+            ..ParameterDescription::default()
+        });
+        let written = toml::to_string(&whole).expect("TOML");
+        assert_eq!(toml::from_str::<Descriptor>(&written), Ok(whole));
+        let long = "ä".repeat(LONGEST_TEXT + 1);
+        assert_eq!(shortened(long).chars().count(), LONGEST_TEXT + 1);
+    }
+}
