@@ -14,6 +14,7 @@ use ros::sizes::Seen;
 use tokio::sync::watch;
 
 use crate::inside::{Inside, Joining, Looked};
+use crate::lifecycle::{Lifecycles, Stages};
 use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
 use crate::tap::Tap;
 use crate::trial::{self, Material, Pace, Replay};
@@ -28,6 +29,7 @@ pub(crate) struct InProcess {
     hub: Arc<Hub>,
     /// What the robot's stubs have started.
     nodes: Arc<dyn Nodes>,
+    lifecycles: Option<Lifecycles>,
     /// What must be there while this is.
     _keeps: Box<dyn Any + Send + Sync>,
 }
@@ -43,6 +45,7 @@ pub(crate) struct Behind {
     /// The bus of those who look into it.
     pub(crate) inside: Joining,
     pub(crate) registry: Arc<Registry>,
+    pub(crate) lifecycles: Option<Lifecycles>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,
 }
 
@@ -54,6 +57,7 @@ impl InProcess {
             linked: (linked, nodes),
             inside,
             registry,
+            lifecycles,
             keeps,
         } = behind;
         let tap = Arc::new(Tap::default());
@@ -88,6 +92,7 @@ impl InProcess {
             tap,
             hub,
             nodes,
+            lifecycles,
             _keeps: keeps,
         }
     }
@@ -127,15 +132,22 @@ impl Reach for InProcess {
         Some(Arc::clone(&self.tap))
     }
 
+    fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
+        self.lifecycles.as_ref().map(Lifecycles::stages)
+    }
+
     async fn linked(&self) -> Vec<Linked> {
         self.nodes.running().await
     }
 
     async fn start_linked(&self, node: &Node) -> Result<(), Error> {
-        for (key, value) in self.nodes.parameters(node) {
-            self.bus.parameters()?.set(&key, value).await?;
+        // Where there are none, the node's own are on its command line.
+        if let Ok(parameters) = self.bus.parameters() {
+            for (key, value) in self.nodes.parameters(node) {
+                parameters.set(&key, value).await?;
+            }
         }
-        self.nodes.start(node).await.map_err(Error::Linked)
+        self.nodes.start(node, "").await.map_err(Error::Linked)
     }
 
     fn links(&self) -> Vec<LinkStatus> {

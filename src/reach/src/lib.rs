@@ -18,6 +18,7 @@ mod ends;
 pub mod group;
 mod in_process;
 mod inside;
+pub mod lifecycle;
 pub mod links;
 mod local;
 pub mod master;
@@ -50,6 +51,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
 use egress::Relays;
+use lifecycle::Stages;
 use links::LinkStatus;
 use tap::Tap;
 
@@ -110,6 +112,8 @@ pub trait Tenant: Send + Sync + 'static {
 pub struct ReachOptions {
     /// What its nodes speak.
     pub ros: RosVersion,
+    /// What `$ROS_DISTRO` stands for there, for a ROS that does not tell it; may be empty.
+    pub distribution: String,
     /// Sessions of rosbridge.
     pub bridge: BridgeOptions,
     /// How long a link outlives its connection.
@@ -171,6 +175,10 @@ pub trait Reach: Send + Sync + 'static {
     }
     /// How its links are doing, by node.
     fn links(&self) -> Vec<LinkStatus>;
+    /// Where its nodes are that have a lifecycle, now and later; none where its ROS knows none.
+    fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
+        None
+    }
     /// Nodes that stubs have started and that run.
     async fn linked(&self) -> Vec<Linked> {
         Vec::new()

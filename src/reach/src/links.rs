@@ -22,8 +22,11 @@ mod node_link;
 mod nodes;
 mod outputs;
 mod parameters;
+mod runs;
+mod seen;
 mod status;
 mod turns;
+mod types;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -32,7 +35,7 @@ use std::time::Duration;
 
 use budget::Budget;
 use parking_lot::Mutex;
-use ros::bus::{Bus, ParamValue};
+use ros::bus::{Bus, ParamValue, RosVersion};
 use ros::schema::Registry;
 use ros::sizes::{Inputs, Seen};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -62,8 +65,6 @@ const STOP: [(i32, Duration); 3] = [
     (15, Duration::from_secs(2)),
     (9, Duration::from_secs(5)),
 ];
-/// Where the runs of nodes are remembered beyond this process: below this key of the servant's parameters.
-const RUNS: &str = "/cloudroid_runs";
 
 /// Habits of a hub.
 #[derive(Debug, Clone)]
@@ -279,7 +280,12 @@ impl Hub {
         hello: &Hello,
     ) -> Result<(Arc<NodeLink>, bool, u64), Refusal> {
         let node = &hello.node.name;
-        if !ros::ros1::names::is_global(node) {
+        self.check_ros(hello.ros)?;
+        let is_global = match self.bus.version() {
+            RosVersion::One => ros::ros1::names::is_global,
+            RosVersion::Two => ros::ros2::names::is_global,
+        };
+        if !is_global(node) {
             return Err(Refusal::final_(format!(
                 "{node:?} is not an absolute node name"
             )));
@@ -315,23 +321,17 @@ impl Hub {
         }
         self.parameters.watch(self).await;
         lent::begin(self).await;
-        let run_key = format!("{RUNS}/{}", node.trim_start_matches('/').replace('/', "__"));
         let running = self.nodes.is_running(node).await;
-        let ours = running
-            && self.bus.parameter(&run_key).await.ok()
-                == Some(ParamValue::String(hello.run.clone()));
+        let ours = running && self.is_of_run(node, &hello.run).await;
         if running && !ours {
             self.stop(node).await;
         }
         self.parameters.take(self, hello).await;
         let lines = self.nodes.lines(node);
         if !ours {
-            if let Ok(parameters) = self.bus.parameters() {
-                let run = ParamValue::String(hello.run.clone());
-                let _ = parameters.set(&run_key, run).await;
-            }
+            self.note_run(node, &hello.run).await;
             self.nodes
-                .start(&hello.node)
+                .start(&hello.node, &hello.run)
                 .await
                 .map_err(Refusal::final_)?;
         }
@@ -360,6 +360,22 @@ impl Hub {
         self.changed();
         let turn = *link.kick.borrow();
         Ok((link, false, turn))
+    }
+
+    /// A robot of the other ROS has nothing that the servant's nodes understand. Earlier stubs do not say; they are of ROS 1.
+    fn check_ros(&self, robot: u8) -> Result<(), Refusal> {
+        let (ours, robot) = (self.bus.version().number(), robot.max(1));
+        if ours == robot {
+            return Ok(());
+        }
+        let service = match self.nodes.service() {
+            "" => format!("servant {}", self.servant),
+            service => format!("service {service}"),
+        };
+        Err(Refusal::final_(format!(
+            "{service} is of ROS {ours} and this robot is of ROS {robot}, whose messages are others: push the package for ROS {robot} and \
+             install the stub of that service, or start this stub where ROS {ours} is set up"
+        )))
     }
 
     fn check_open(&self) -> Result<(), Refusal> {

@@ -12,6 +12,8 @@ use servant::local::{LocalEngine, LocalServant};
 
 use crate::egress::{self, Relays};
 use crate::in_process::{Behind, InProcess};
+use crate::lifecycle::Lifecycles;
+use crate::links::Nodes;
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
 use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, master};
@@ -58,6 +60,7 @@ impl Opener for LocalOpener {
         let joining = JoinOptions {
             budget: options.budget.clone(),
             unfinished: options.unfinished,
+            distribution: options.distribution.clone(),
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));
@@ -71,7 +74,9 @@ impl Opener for LocalOpener {
         let bus = bus?;
         let registry = Arc::clone(&recorded.registry);
         let relays = self.relays(&local, &recorded.egress).await;
-        let nodes = Arc::new(LinkedNodes::new(recorded, servant, observer));
+        let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
+        let nodes: Arc<dyn Nodes> = Arc::new(nodes);
+        let lifecycles = Lifecycles::follow(&bus, &nodes, &observer);
         let behind = Behind {
             id: servant.id().to_owned(),
             linked: (Arc::clone(&bus), nodes),
@@ -80,6 +85,7 @@ impl Opener for LocalOpener {
                 ros::connect(ros, Arc::clone(&beside) as _, looking.clone()).boxed()
             }),
             registry,
+            lifecycles,
             keeps: Box::new(relays),
         };
         Ok(Arc::new(InProcess::new(behind, options)))

@@ -12,8 +12,9 @@ use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
+use ros::flavour::Identity;
 use servant::engine::{LogStart, NodeExit, Servant};
-use servant::spec::NodeSpec;
+use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
 use crate::links::Nodes;
@@ -94,6 +95,20 @@ pub(crate) fn program<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a Str
     })
 }
 
+/// The robot's own arguments, then what the deployer gave, then what makes it this node. In ROS 2 (rcl's arguments.c) the later one of
+/// two values of a parameter counts, `--ros-args` may come again while its arguments go on, and `--` ends them; so the deployer's
+/// win over the robot's, whether or not the robot's were ended.
+fn command_line(
+    program: &str,
+    robots: impl Iterator<Item = String>,
+    given: Vec<String>,
+    identity: &Identity,
+) -> Vec<String> {
+    let program = std::iter::once(program.to_owned()).chain(robots);
+    let given = given.into_iter().chain(identity.arguments.iter().cloned());
+    program.chain(given).collect()
+}
+
 /// The revision's own nodes that run this executable.
 pub(crate) fn running<'a>(
     recorded: &'a Recorded,
@@ -107,7 +122,11 @@ pub(crate) fn running<'a>(
 
 #[async_trait]
 impl Nodes for LinkedNodes {
-    async fn start(&self, node: &Node) -> Result<(), String> {
+    fn service(&self) -> &str {
+        &self.recorded.service
+    }
+
+    async fn start(&self, node: &Node, run: &str) -> Result<(), String> {
         let tenant = self.told.tenant()?;
         self.told.observer().fits(node.revision, &node.image)?;
         let program = program(&self.recorded, node)?;
@@ -115,19 +134,24 @@ impl Nodes for LinkedNodes {
         let identity = self.recorded.flavour.identity(&node.name);
         let mut given = self.recorded.parameters.clone();
         given.extend(self.parameters(node));
-        let mut argv = vec![program.clone()];
-        argv.extend(self.recorded.flavour.arguments(&node.name, &given));
-        argv.extend(
-            node.argv
-                .iter()
-                .map(|argument| self.translate(node, argument)),
+        let robots = node.argv.iter();
+        let robots = robots.map(|argument| self.translate(node, argument));
+        let flavour = &self.recorded.flavour;
+        let argv = command_line(
+            program,
+            robots,
+            flavour.arguments(&node.name, &given),
+            &identity,
         );
-        argv.extend(identity.arguments);
         let directory = self.directory(node, program);
+        let mut environment = identity.environment;
+        if !run.is_empty() {
+            environment.insert(RUN.to_owned(), run.to_owned());
+        }
         let spec = NodeSpec {
             name: node.name.clone(),
             argv,
-            environment: identity.environment,
+            environment,
             directory,
             respawn: false,
             respawn_delay: 0.0,
@@ -137,6 +161,10 @@ impl Nodes for LinkedNodes {
         started.map_err(|error| format!("{} cannot be started: {error}", node.name))?;
         self.started.lock().insert(node.name.clone(), node.clone());
         Ok(())
+    }
+
+    fn run(&self, node: &str) -> Option<String> {
+        self.container.run(node)
     }
 
     async fn running(&self) -> Vec<Linked> {
@@ -246,6 +274,7 @@ impl Nodes for LinkedNodes {
 #[cfg(test)]
 mod tests {
     use package::inventory::Inventory;
+    use ros::flavour::{Flavour, Version};
 
     use super::*;
 
@@ -307,5 +336,30 @@ mod tests {
         ] {
             assert_eq!(asks(package, executable), None, "{package} {executable}");
         }
+    }
+
+    #[test]
+    fn the_deployers_parameters_come_behind_the_robots() {
+        let given = BTreeMap::from([("/camera/see/gain".to_owned(), ParamValue::Int(2))]);
+        let started = |ros, argv: &[&str]| {
+            let flavour = Flavour {
+                ros,
+                ..Flavour::default()
+            };
+            let robots = argv.iter().map(|argument| (*argument).to_owned());
+            let given = flavour.arguments("/camera/see", &given);
+            let identity = flavour.identity("/camera/see");
+            command_line("/opt/see", robots, given, &identity).join(" ")
+        };
+        let robots = ["plain", "--ros-args", "-p", "gain:=1", "-r", "scan:=/front"];
+        assert_eq!(
+            started(Version::Ros2, &robots),
+            "/opt/see plain --ros-args -p gain:=1 -r scan:=/front --ros-args -p gain:=2 -- --ros-args -r __node:=see -r __ns:=/camera"
+        );
+        // Those of ROS 1 are on the parameter server.
+        assert_eq!(
+            started(Version::Ros1, &["_gain:=1", "scan:=/front"]),
+            "/opt/see _gain:=1 scan:=/front __name:=see"
+        );
     }
 }

@@ -76,6 +76,7 @@ mod tests {
             nodes: vec!["/node".into()],
             latched: false,
             lazy,
+            qos: None,
         }
     }
 

@@ -16,6 +16,7 @@ use ros::bus::{
     GoalEvents, Graph, Hearing, Lending, NodeParameters, Outcome, Publisher, Qos, RosVersion,
     ServiceHandler, ServiceType, Subscription, WireType,
 };
+use ros::ros2::names;
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
 
@@ -242,6 +243,10 @@ struct TappedBus {
 
 impl TappedBus {
     fn call_begins(&self, service: &str, request: &Bytes) -> Option<Noted> {
+        // A part of an action of ROS 2: what it answers has stamps in it, and a goal is not compared by its parts.
+        if self.bus.version() == RosVersion::Two && names::is_hidden(service) {
+            return None;
+        }
         self.tap.asked(request, |request| What::Call {
             service: service.to_owned(),
             request,

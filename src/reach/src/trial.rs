@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use api::trial::{Fed, Heard, Times, Trial};
 use package::interface::Interface;
 use ros::bag::Recorded;
-use ros::bus::{Bus, Publisher, Qos, reaches};
+use ros::bus::{Bus, Publisher, RosVersion, reaches};
 use ros::schema::Registry;
 use tokio::time::timeout;
 
@@ -23,7 +23,7 @@ pub use picture::Picture;
 use crate::Error;
 use ears::Ears;
 use pace::Clock;
-use plan::Plan;
+use plan::{Input, Plan};
 
 /// For the servant's nodes to listen, and for the first answer, at least.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -62,17 +62,17 @@ pub struct Replay {
 
 /// Refuses material that a service of this interface has no input for, and an `input` that it does not feed.
 pub fn fits(
-    service: &str,
+    (service, ros): (&str, RosVersion),
     interface: &Interface,
     material: &Material,
     input: Option<&str>,
 ) -> Result<(), Error> {
-    let registry = registry(service, interface)?;
+    let registry = registry((service, ros), interface)?;
     Plan::new(interface, &registry, material, input).map(|_| ())
 }
 
-fn registry(service: &str, interface: &Interface) -> Result<Registry, Error> {
-    Registry::from_definitions(&interface.definitions)
+fn registry((service, ros): (&str, RosVersion), interface: &Interface) -> Result<Registry, Error> {
+    Registry::of_definitions(ros, &interface.definitions)
         .map_err(|error| Error::Trial(format!("a definition of {service}: {error}")))
 }
 
@@ -84,14 +84,19 @@ pub(crate) async fn replay(
     material: &Material,
     pace: &Pace,
 ) -> Result<Replay, Error> {
-    let registry = registry(service, interface)?;
+    let registry = registry((service, bus.version()), interface)?;
     let plan = Plan::new(interface, &registry, material, pace.input.as_deref())?;
     let mut ears = Ears::open(bus, interface).await?;
     let first_answer = pace.answer.max(PATIENCE);
     let mut mouths = Vec::new();
-    for (topic, wire_type) in &plan.inputs {
+    for Input {
+        topic,
+        wire_type,
+        qos,
+    } in &plan.inputs
+    {
         let publisher = bus
-            .advertise(topic, wire_type.clone(), Qos::keep_last(QUEUE))
+            .advertise(topic, wire_type.clone(), *qos)
             .await
             .map_err(failed)?;
         let listening = reaches(publisher.matched(), 1);
@@ -115,7 +120,7 @@ pub(crate) async fn replay(
             break;
         }
         tokio::time::sleep_until(due).await;
-        let message = item.content.message(turn);
+        let message = item.content.message(turn, bus.version());
         ears.forget();
         let asked = Instant::now();
         let mouth = &mut mouths[item.input];
@@ -136,9 +141,9 @@ pub(crate) async fn replay(
     let fed = plan.inputs.iter().zip(&mouths).enumerate();
     Ok(Replay {
         inputs: fed
-            .map(|(number, ((topic, wire_type), mouth))| Fed {
-                topic: topic.clone(),
-                type_name: wire_type.name.clone(),
+            .map(|(number, (input, mouth))| Fed {
+                topic: input.topic.clone(),
+                type_name: input.wire_type.name.clone(),
                 sent: mouth.sent,
                 from: plan.recorded_for(number),
             })

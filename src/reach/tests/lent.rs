@@ -30,7 +30,7 @@ struct Still;
 
 #[async_trait]
 impl Nodes for Still {
-    async fn start(&self, _: &Node) -> Result<(), String> {
+    async fn start(&self, _: &Node, _: &str) -> Result<(), String> {
         Ok(())
     }
     async fn signal(&self, _: &str, _: i32) -> Result<(), String> {

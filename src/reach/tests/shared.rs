@@ -172,6 +172,7 @@ impl Handler<FromCloud> for Ear {
 fn place(group: &Arc<Group>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
     let options = ReachOptions {
         ros: RosVersion::One,
+        distribution: "noetic".into(),
         bridge: BridgeOptions::default(),
         grace: Duration::from_secs(30),
         budget: Budget::unlimited(),

@@ -170,6 +170,10 @@ pub trait Servant: Send + Sync + 'static {
     }
     /// Names of the nodes that were ever started in it, or are about to be.
     fn nodes(&self) -> Vec<String>;
+    /// For which run of its starter's a node was started last ([`crate::spec::RUN`]); none where nobody said so.
+    fn run(&self, _node: &str) -> Option<String> {
+        None
+    }
     /// Starts one more node; returns when its program is executed, or with the reason why it could not be.
     async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
     /// Sends a signal to a node.

@@ -19,6 +19,9 @@ pub struct NodeStatus {
     pub exit: Option<NodeExit>,
     /// How often it was started.
     pub starts: u32,
+    /// For which run of its starter's, if that said so ([`crate::spec::RUN`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<String>,
 }
 
 impl NodeStatus {

@@ -66,6 +66,10 @@ impl Limits {
     }
 }
 
+/// The variable in the environment of a node that says for which run of its starter's it was started; so it is known to later
+/// daemons ([`crate::engine::Servant::run`]).
+pub const RUN: &str = "CLOUDROID_RUN";
+
 /// One process to run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NodeSpec {

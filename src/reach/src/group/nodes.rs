@@ -146,7 +146,11 @@ fn below<'a>(
 
 #[async_trait]
 impl Nodes for SharedNodes {
-    async fn start(&self, node: &Node) -> Result<(), String> {
+    fn service(&self) -> &str {
+        &self.recorded.service
+    }
+
+    async fn start(&self, node: &Node, _run: &str) -> Result<(), String> {
         let tenant = self.told.tenant()?;
         self.told.observer().fits(node.revision, &node.image)?;
         let view = self.view(node)?;

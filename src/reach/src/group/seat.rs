@@ -32,6 +32,8 @@ pub fn seat(
             async move { Ok(shown) }.boxed()
         }),
         registry,
+        // Those of its servants are looked after there.
+        lifecycles: None,
         keeps: Box::new(()),
     };
     Arc::new(InProcess::new(behind, options))

@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Publisher, Qos, WireType};
+use ros::bus::{Graph, Liveliness, Publisher, Qos, RosVersion, WireType};
 use ros::ring::{Bounds, Ring};
-use ros::schema::MessageType;
+use ros::schema::{MessageType, SchemaError};
 use ros::sizes::Sizes;
 
-use super::Hub;
+use super::{Hub, types};
 use link::clock::now;
 use link::control::Input;
 use link::drops::{Cause, Drops};
@@ -21,6 +21,9 @@ use ros::codec::Stamps;
 
 /// Messages kept for a slow node.
 const QUEUE: usize = 256;
+/// Messages of a transient-local publisher of ROS 2 that newcomers are given, where the robot does not tell how many it keeps:
+/// what ROS 2 itself takes where nobody says it.
+const KEPT: usize = 10;
 /// So many times the warm-up a node that has registered is waited for where nobody is connected.
 const ALONE: u32 = 10;
 /// What waits until the topic is advertised and the node connected.
@@ -30,7 +33,8 @@ const WAITING: Bounds = Bounds {
 };
 
 /// Where types that begin with a header have their stamp. Those that do not have something there, too; it tells no
-/// worse than nothing which input an output answers.
+/// worse than nothing which input an output answers. In ROS 1 the header's number stands before the stamp, in ROS 2 the four bytes
+/// that say how the message is written: seconds and nanoseconds stand at the same place.
 pub(super) type Mark = Option<[u8; 8]>;
 
 /// The mark of a message as the node sees it.
@@ -61,8 +65,7 @@ enum State {
 impl Inputs {
     /// Messages of this channel may come before it is open.
     pub(super) fn expect(&self, hub: &Hub, input: &Input) {
-        let of = MessageType::from_full_text(&input.type_name, &input.definition);
-        let of = of.inspect_err(|error| {
+        let of = definition(hub, input).inspect_err(|error| {
             tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
         });
         let of = of.ok();
@@ -108,8 +111,8 @@ impl Inputs {
 
     /// Advertises, and lets messages through once the node has connected.
     pub(super) async fn open(&self, hub: &Arc<Hub>, drops: &Drops, input: Input) {
-        let of = WireType::new(&input.type_name, &input.md5, &input.definition);
-        let qos = Qos::keep_last(QUEUE).latching(input.latching);
+        let of = wire_type(hub, &input);
+        let qos = offer(&input, hub.bus.version(), &hub.bus.graph().borrow());
         let publisher: Arc<dyn Publisher> = match hub.bus.advertise(&input.topic, of, qos).await {
             Ok(publisher) => publisher.into(),
             Err(error) => {
@@ -127,7 +130,9 @@ impl Inputs {
         // Who only observes what flows may be connected before the node is.
         let listeners = graph.topics.get(&input.topic).map_or(0, |ends| {
             let nodes = ends.subscribers.iter();
-            nodes.filter(|node| *node != bridge::INSIDE).count()
+            let own = hub.bus.node();
+            let beside = nodes.filter(|node| *node != bridge::INSIDE && *node != own);
+            beside.count()
         });
         let mut matched = publisher.matched();
         let mut connected = async |count: usize, patience: Duration| {
@@ -165,10 +170,134 @@ impl Inputs {
     }
 }
 
+fn wire_type(hub: &Hub, input: &Input) -> WireType {
+    WireType::new(&input.type_name, &input.md5, &input.definition).written_by(hub.bus.version())
+}
+
+/// What an input's type is. Publishers of ROS 1 tell it; of ROS 2 the image knows it, if it has the same.
+fn definition(hub: &Hub, input: &Input) -> Result<Arc<MessageType>, SchemaError> {
+    if hub.bus.version() == RosVersion::One {
+        return MessageType::from_full_text(&input.type_name, &input.definition);
+    }
+    let of = wire_type(hub, input);
+    types::message(&hub.registry, &of).map_or_else(|| of.schema(), Ok)
+}
+
+/// What is offered to nodes in place of the robot's publisher. In ROS 2 a reliable publisher is heard by those, too, who do not
+/// ask for one; of time it offers what the robot's does, else what is asked for, which the robot's must offer to be heard at all.
+fn offer(input: &Input, version: RosVersion, graph: &Graph) -> Qos {
+    let latching = input.latching;
+    if version == RosVersion::One {
+        return Qos::keep_last(QUEUE).latching(latching);
+    }
+    let told = input.qos.as_ref().map(|qos| qos.to_qos(1));
+    let kept = told.map_or(KEPT, |told| told.depth);
+    let latching = latching || told.is_some_and(|told| told.is_latching());
+    let mut offer = Qos {
+        lifespan: told.and_then(|told| told.lifespan),
+        ..Qos::keep_last(if latching { kept } else { QUEUE }).latching(latching)
+    };
+    let asked = graph.ends.values();
+    let asked = asked.filter_map(|node| node.subscribers.get(&input.topic));
+    for of in told.into_iter().chain(asked.map(|(_, qos)| *qos)) {
+        let least = |one: Option<Duration>, two| one.into_iter().chain(two).min();
+        offer.deadline = least(offer.deadline, of.deadline);
+        offer.lease = least(offer.lease, of.lease);
+        if of.liveliness == Liveliness::ManualByTopic {
+            offer.liveliness = Liveliness::ManualByTopic;
+        }
+    }
+    offer
+}
+
 /// Where the stamps of an input stand. `/clock` tells simulated time.
 fn stamps(input: &Input, of: Option<&MessageType>) -> Stamps {
     match of {
         Some(of) if input.topic != "/clock" => Stamps::of(of),
         _ => Stamps::default(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::bus::{NodeEnds, Reliability};
+
+    use super::*;
+
+    fn asks(qos: Qos) -> Graph {
+        let of = WireType::named("std_msgs/msg/String").written_by(RosVersion::Two);
+        let ends = NodeEnds {
+            subscribers: [("/scan".to_owned(), (of, qos))].into(),
+            ..NodeEnds::default()
+        };
+        Graph {
+            ends: [("/see".to_owned(), ends)].into(),
+            ..Graph::default()
+        }
+    }
+
+    fn input(latching: bool, qos: Option<link::control::Qos>) -> Input {
+        Input {
+            topic: "/scan".to_owned(),
+            latching,
+            qos,
+            ..Input::default()
+        }
+    }
+
+    #[test]
+    fn nodes_are_offered_what_they_ask_for() {
+        let asked = Qos {
+            reliability: Reliability::BestEffort,
+            deadline: Some(Duration::from_millis(100)),
+            lease: Some(Duration::from_secs(2)),
+            liveliness: Liveliness::ManualByTopic,
+            ..Qos::keep_last(5)
+        };
+        let offered = offer(&input(false, None), RosVersion::Two, &asks(asked));
+        assert_eq!(
+            offered,
+            Qos {
+                reliability: Reliability::Reliable,
+                depth: QUEUE,
+                ..asked
+            }
+        );
+        // What the robot's publisher offers may be more.
+        let told = link::control::Qos {
+            transient_local: true,
+            depth: 3,
+            deadline: Some(0.05),
+            ..Default::default()
+        };
+        let offered = offer(&input(false, Some(told)), RosVersion::Two, &asks(asked));
+        assert_eq!(offered.deadline, Some(Duration::from_millis(50)));
+        assert!(offered.is_latching());
+        assert_eq!(offered.depth, 3);
+    }
+
+    #[test]
+    fn old_maps_are_not_given_to_newcomers_for_ever() {
+        let graph = Graph::default();
+        let of = |latching, version| offer(&input(latching, None), version, &graph);
+        assert_eq!(
+            of(true, RosVersion::Two),
+            Qos::keep_last(KEPT).latching(true)
+        );
+        assert_eq!(of(false, RosVersion::Two), Qos::keep_last(QUEUE));
+        // Those of ROS 1 are given the last one, however many wait.
+        assert_eq!(
+            of(true, RosVersion::One),
+            Qos::keep_last(QUEUE).latching(true)
+        );
+    }
+
+    #[test]
+    fn a_stamp_of_either_ros_is_found() {
+        let stamp = [7, 0, 0, 0, 9, 0, 0, 0];
+        for before in [[1, 0, 0, 0], [0, 1, 0, 0]] {
+            let message = [&before[..], &stamp, b"map"].concat();
+            assert_eq!(mark(&message), Some(stamp));
+        }
     }
 }

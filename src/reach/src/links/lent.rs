@@ -1,5 +1,5 @@
-//! Services of the robot, for nodes of the servant. The Master tells of a lookup that found nothing; it is passed to
-//! the robot, whose answer holds until the robot says otherwise; it is asked again now and then, since a server that
+//! Services of the robot, for nodes of the servant. The bus tells of a node that looks for a service which is not there (in ROS 1
+//! the Master is asked for it, in ROS 2 the node has a client without a server); it is passed to the robot, whose answer holds until the robot says otherwise; it is asked again now and then, since a server that
 //! starts anew under the same name may serve another type. See docs/adr/025.
 //!
 //! ```text
@@ -17,12 +17,12 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{BusError, Digest, Lender, Lent, ServiceHandler, ServiceType};
+use ros::bus::{BusError, Lender, Lent, RosVersion, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
-use super::Hub;
 use super::node_link::NodeLink;
+use super::{Hub, types};
 use link::control::{FromCloud, Served};
 use link::skew::Direction;
 use ros::codec::Stamps;
@@ -74,9 +74,7 @@ impl There {
     /// Whether the robot tells of the same once more.
     fn is(&self, served: &Served) -> bool {
         let ours = &self.service_type;
-        self.channel == served.channel
-            && ours.name == served.type_name
-            && ours.digest == *served.md5
+        self.channel == served.channel && *ours == served.service_type(ours.format.version())
     }
 }
 
@@ -262,25 +260,32 @@ impl Drop for Abandoned<'_> {
 }
 
 fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
-    let known = hub.registry.service(&served.type_name).ok();
-    let known = known.filter(|known| known.md5 == served.md5);
+    let of = served.service_type(hub.bus.version());
+    let known = types::service(&hub.registry, &of);
     if known.is_none() && hub.skew.difference() != 0 {
         link.session.report(&FromCloud::Notice {
             warning: true,
             text: format!(
-                "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with md5sum {}; push the package with the Debian package that holds it (--with DEB)",
-                served.name, served.type_name, served.md5
+                "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with {}; push the package with the Debian package that holds it (--with DEB)",
+                served.name, of.name, told_apart(&of)
             ),
         });
     }
-    let stamps = known.map(|known| (Stamps::of(&known.request), Stamps::of(&known.response)));
-    let (request, response) = stamps.unwrap_or_default();
+    let (request, response) = types::stamps_of_calls(known.as_deref());
     There {
         channel: served.channel,
-        service_type: ServiceType::new(served.type_name, served.md5),
+        service_type: of,
         request,
         response,
         gone: watch::Sender::new(false),
+    }
+}
+
+/// What tells a type from others of its name, in the words of its ROS.
+fn told_apart(of: &ServiceType) -> String {
+    match of.format.version() {
+        RosVersion::One => format!("md5sum {}", of.digest),
+        RosVersion::Two => format!("type hashes {} and {}", of.request, of.response),
     }
 }
 
@@ -324,7 +329,7 @@ impl Lender for Robot {
             handler: Arc::new(Passing {
                 hub: self.0.clone(),
                 service: service.to_owned(),
-                digest: there.service_type.digest.clone(),
+                of: there.service_type.clone(),
             }),
         })
     }
@@ -334,7 +339,8 @@ impl Lender for Robot {
 struct Passing {
     hub: Weak<Hub>,
     service: String,
-    digest: Digest,
+    /// As the node was told.
+    of: ServiceType,
 }
 
 #[async_trait]
@@ -346,10 +352,12 @@ impl ServiceHandler for Passing {
         let found = link.and_then(|link| Some((has(&link)?, link)));
         let (there, link) =
             found.ok_or_else(|| format!("nobody on the robot serves {} any more", self.service))?;
-        if there.service_type.digest != self.digest {
+        if there.service_type != self.of {
             return Err(format!(
-                "{} is served on the robot with md5sum {} now, not {} as when it was connected to",
-                self.service, there.service_type.digest, self.digest
+                "{} is served on the robot with {} now, not {} as when it was connected to",
+                self.service,
+                told_apart(&there.service_type),
+                told_apart(&self.of)
             ));
         }
         let request = hub.skew.apply(Direction::Out, &there.request, request);

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use ros::bus::{Digest, ServiceType, WireType};
 
-use super::Hub;
 use super::node_link::{NodeLink, Service};
+use super::seen::{Declared, Seen};
+use super::{Hub, types};
 use link::control::{FromCloud, Graph, Output, Served, Wanted};
 use ros::codec::Stamps;
 
@@ -38,13 +39,9 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
 
 impl Sent {
     async fn report(&mut self, link: &Arc<NodeLink>, hub: &Arc<Hub>) {
-        let seen = hub.bus.graph().borrow().clone();
-        let listening: BTreeSet<String> = seen
-            .topics
-            .iter()
-            .filter(|(_, ends)| ends.subscribers.contains(&link.node))
-            .map(|(topic, _)| topic.clone())
-            .collect();
+        let graph = hub.bus.graph().borrow().clone();
+        let seen = Seen::of(&graph, &link.node, hub.bus.version());
+        let listening: BTreeSet<String> = seen.inputs.keys().cloned().collect();
         let before = std::mem::replace(&mut *link.listening.lock(), listening.clone());
         if before != listening {
             hub.changed();
@@ -53,39 +50,32 @@ impl Sent {
             siblings: hub.siblings(&link.node),
             ..Graph::default()
         };
-        for (topic, ends) in &seen.topics {
-            let wire_type = if ends.publishers.contains(&link.node) {
-                self.type_of(link, hub, topic, &ends.type_name).await
-            } else {
-                None
+        for (topic, declared) in &seen.outputs {
+            let Some(of) = output_type(hub, topic, declared).await else {
+                continue;
             };
-            if let Some(wire_type) = wire_type {
-                let channel = self.channel(link, topic, &wire_type);
-                graph.outputs.push(Output {
-                    channel,
-                    topic: topic.clone(),
-                    type_name: wire_type.name,
-                    md5: wire_type.digest.to_string(),
-                    qos: None,
-                });
-            }
-            if listening.contains(topic) {
-                let known = hub.registry.message(&ends.type_name).ok();
-                graph.inputs.push(Wanted {
-                    topic: topic.clone(),
-                    type_name: ends.type_name.clone(),
-                    md5: known.map_or_else(|| "*".to_owned(), |known| known.md5().to_owned()),
-                    feed: hub.feeder(topic).as_deref() == Some(&link.node),
-                    qos: None,
-                });
-            }
+            self.tell(link, &of);
+            graph.outputs.push(Output {
+                channel: self.channel(link, hub, topic, &of),
+                topic: topic.clone(),
+                type_name: of.name,
+                md5: of.digest.to_string(),
+                qos: declared.qos(),
+            });
         }
-        for (service, server) in &seen.services {
-            if *server == link.node {
-                graph
-                    .services
-                    .extend(self.service(link, hub, service).await);
-            }
+        for (topic, declared) in &seen.inputs {
+            let (type_name, md5) = self.input_type(link, hub, declared);
+            graph.inputs.push(Wanted {
+                topic: topic.clone(),
+                type_name,
+                md5,
+                feed: hub.feeder(topic).as_deref() == Some(&link.node),
+                qos: declared.qos(),
+            });
+        }
+        for (service, of) in &seen.services {
+            let served = self.service(link, hub, service, of.as_ref()).await;
+            graph.services.extend(served);
         }
         self.let_go(link, &graph);
         if self.graph.as_ref() != Some(&graph) {
@@ -94,72 +84,99 @@ impl Sent {
         }
     }
 
-    /// The type with its definition; told before it is used.
-    async fn type_of(
-        &mut self,
-        link: &NodeLink,
-        hub: &Hub,
-        topic: &str,
-        name: &str,
-    ) -> Option<WireType> {
-        let wire_type = match hub.registry.message(name) {
-            Ok(known) => WireType::of(&known),
-            // Its node knows.
-            Err(_) => hub.bus.topic_type(topic).await.ok()?,
-        };
-        let key = (wire_type.name.clone(), wire_type.digest.clone());
+    /// Tells of a type before it is used.
+    fn tell(&mut self, link: &NodeLink, of: &WireType) {
+        let key = (of.name.clone(), of.digest.clone());
         if self.types.insert(key) {
             link.session.report(&FromCloud::Type {
-                name: wire_type.name.clone(),
-                md5: wire_type.digest.to_string(),
-                definition: wire_type.definition.clone(),
+                name: of.name.clone(),
+                md5: of.digest.to_string(),
+                definition: of.definition.clone(),
             });
         }
-        Some(wire_type)
     }
 
-    fn channel(&mut self, link: &NodeLink, topic: &str, wire_type: &WireType) -> u32 {
+    /// Name and digest of an input's type.
+    fn input_type(&mut self, link: &NodeLink, hub: &Hub, declared: &Declared) -> (String, String) {
+        match declared {
+            Declared::Named(name) => {
+                let known = hub.registry.message(name).ok();
+                let md5 = known.map_or_else(|| "*".to_owned(), |known| known.md5().to_owned());
+                (name.clone(), md5)
+            }
+            Declared::Told(of, _) => {
+                // The robot's publishers do not tell their definitions, and its end needs them.
+                if let Some(known) = types::message(&hub.registry, of) {
+                    let definition = known.full_text().into();
+                    self.tell(
+                        link,
+                        &WireType {
+                            definition,
+                            ..of.clone()
+                        },
+                    );
+                }
+                (of.name.clone(), of.digest.to_string())
+            }
+        }
+    }
+
+    fn channel(&mut self, link: &NodeLink, hub: &Hub, topic: &str, of: &WireType) -> u32 {
         if let Some(channel) = self.channels.get(topic) {
             return *channel;
         }
         self.next += 1;
         self.channels.insert(topic.to_owned(), self.next);
-        let stamps = wire_type
-            .schema()
-            .map(|of| Stamps::of(&of))
-            .unwrap_or_default();
+        // A type that comes with an action has a definition in the image alone.
+        let known = of.schema().ok();
+        let known = known.or_else(|| types::message(&hub.registry, of));
+        let stamps = known.map(|of| Stamps::of(&of)).unwrap_or_default();
         link.outputs.add(self.next, topic, stamps);
-        let schema = codec::Schema::of(&wire_type.name, wire_type.digest.as_str());
+        let schema = codec::Schema::of(&of.name, of.digest.as_str());
         link.session.opens(self.next, topic, schema);
         self.next
     }
 
-    async fn service(&mut self, link: &NodeLink, hub: &Hub, name: &str) -> Option<Served> {
-        let (channel, service_type) = match self.services.get(name) {
-            Some(known) => known.clone(),
-            None => {
-                let service_type = hub.bus.service_type(name).await.ok()?;
+    /// A service; `told`: its type, where the server need not be asked.
+    async fn service(
+        &mut self,
+        link: &NodeLink,
+        hub: &Hub,
+        name: &str,
+        told: Option<&ServiceType>,
+    ) -> Option<Served> {
+        let known = self.services.get(name).cloned();
+        let same = |of: &ServiceType| told.is_none_or(|told| told == of);
+        if let Some((channel, of)) = known.as_ref().filter(|(_, of)| same(of)) {
+            return Some(Served::of(*channel, name, of));
+        }
+        let of = match told {
+            Some(told) => told.clone(),
+            None => hub.bus.service_type(name).await.ok()?,
+        };
+        let channel = match known {
+            // The end that answers was found after the one that is asked: more is known of the same.
+            Some((channel, before)) if before.name == of.name && before.agrees(&of) => channel,
+            before => {
+                if let Some((channel, _)) = before {
+                    link.services.lock().remove(&channel);
+                }
                 self.next += 1;
-                let entry = (self.next, service_type);
-                self.services.insert(name.to_owned(), entry.clone());
-                let stamps = hub.registry.service(&entry.1.name).ok();
-                let stamps = stamps.filter(|known| entry.1.digest == *known.md5);
-                let service = Service {
-                    name: name.to_owned(),
-                    sizes: hub.inputs.of(name, stamps.as_ref().map(|of| &*of.request)),
-                    request: stamps
-                        .as_ref()
-                        .map(|of| Stamps::of(&of.request))
-                        .unwrap_or_default(),
-                    response: stamps
-                        .map(|of| Stamps::of(&of.response))
-                        .unwrap_or_default(),
-                };
-                link.services.lock().insert(entry.0, Arc::new(service));
-                entry
+                self.next
             }
         };
-        Some(Served::of(channel, name, &service_type))
+        let known = types::service(&hub.registry, &of);
+        let (request, response) = types::stamps_of_calls(known.as_deref());
+        let service = Service {
+            name: name.to_owned(),
+            sizes: hub.inputs.of(name, known.as_ref().map(|of| &*of.request)),
+            request,
+            response,
+        };
+        link.services.lock().insert(channel, Arc::new(service));
+        let served = Served::of(channel, name, &of);
+        self.services.insert(name.to_owned(), (channel, of));
+        Some(served)
     }
 
     /// Forgets what the node has taken back.
@@ -179,5 +196,20 @@ impl Sent {
             }
             there
         });
+    }
+}
+
+/// The type of an output, with its definition where that is known.
+async fn output_type(hub: &Hub, topic: &str, declared: &Declared) -> Option<WireType> {
+    match declared {
+        Declared::Named(name) => match hub.registry.message(name) {
+            Ok(known) => Some(WireType::of(&known)),
+            // Its node knows.
+            Err(_) => hub.bus.topic_type(topic).await.ok(),
+        },
+        Declared::Told(of, _) => match types::message(&hub.registry, of) {
+            Some(known) => Some(WireType::of(&known)),
+            None => Some(of.clone()),
+        },
     }
 }

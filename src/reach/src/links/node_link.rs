@@ -16,7 +16,7 @@ use super::inputs::Inputs;
 use super::lent::RobotServices;
 use super::outputs::Outputs;
 use super::unsent::Unsent;
-use super::{Hub, LinkStatus, mirror};
+use super::{Hub, LinkStatus, mirror, seen};
 use crate::Flow;
 use link::clock::Sample;
 use link::control::{FromCloud, FromRobot, Hello, Request, Sla};
@@ -25,12 +25,15 @@ use link::record::Record;
 use link::session::{CloudSession, Handler, SessionOptions};
 use link::skew::Direction;
 use ros::codec::Stamps;
+use ros::ros2::names;
 use ros::sizes::Sizes;
 
 /// Requests remembered, for whoever explains.
 const REQUESTS: usize = 128;
 /// Topics that are opened beside each other; more wait, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
+/// For the result of a goal of ROS 2, which is asked for when the goal begins and comes when it ends.
+const GOAL: Duration = Duration::from_secs(24 * 3600);
 /// Between two looks at what was dropped.
 const DROPS: Duration = Duration::from_secs(2);
 
@@ -219,12 +222,9 @@ impl NodeLink {
         };
         let graph = hub.bus.graph();
         let graph = graph.borrow();
-        let sought = graph.sought.iter();
-        let missing = sought.filter(|(service, nodes)| {
-            let served = graph.services.contains_key(*service) || self.lent.has(service);
-            nodes.contains(&self.node) && !served
-        });
-        missing.map(|(service, _)| service.clone()).collect()
+        let mut sought = seen::sought(&graph, &self.node);
+        sought.retain(|service| !self.lent.has(service));
+        sought
     }
 
     /// Our own end publishes what the robot sends.
@@ -235,8 +235,9 @@ impl NodeLink {
         let graph = hub.bus.graph();
         let graph = graph.borrow();
         let fed = |topic: &&String| {
+            // What is not shown is a part of an action of ROS 2, whose server is what is missing then.
             let ends = graph.topics.get(*topic);
-            ends.is_some_and(|ends| !ends.publishers.is_empty())
+            ends.is_none_or(|ends| !ends.publishers.is_empty())
         };
         let listening = self.listening.lock();
         listening
@@ -255,7 +256,10 @@ impl NodeLink {
         let link = Arc::clone(self);
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
         tokio::spawn(async move {
-            let patience = hub.options.call_timeout;
+            let patience = match names::action_part(&service.name) {
+                Some((_, "get_result")) => GOAL,
+                _ => hub.options.call_timeout,
+            };
             service.sizes.note(&request);
             let request = hub.skew.apply(Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;

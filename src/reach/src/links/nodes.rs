@@ -12,8 +12,16 @@ use crate::{Linked, Tenant};
 /// What a servant does for its links.
 #[async_trait]
 pub trait Nodes: Send + Sync + 'static {
-    /// Starts the node; comes back when its program runs, or says why it cannot.
-    async fn start(&self, node: &Node) -> Result<(), String>;
+    /// Which service they are of; may be empty.
+    fn service(&self) -> &str {
+        ""
+    }
+    /// Starts the node for this run of the robot's; comes back when its program runs, or says why it cannot.
+    async fn start(&self, node: &Node, run: &str) -> Result<(), String>;
+    /// For which run the node was started last, by whichever daemon; none where that is not remembered.
+    fn run(&self, _node: &str) -> Option<String> {
+        None
+    }
     /// Sends it a signal.
     async fn signal(&self, node: &str, signal: i32) -> Result<(), String>;
     /// Waits for its end; at once if it does not run.

@@ -130,6 +130,7 @@ impl Outputs {
             Some(hearing) => hearing.heard_over(&topic).await.unwrap_or_default(),
             None => BTreeSet::new(),
         };
+        // As latching as the node: of a bus with qualities of service it is a wish, and the node's own offer is what is heard.
         let subscription = match hub
             .bus
             .subscribe(
@@ -186,10 +187,13 @@ async fn heard(
     publishers: watch::Receiver<Matched>,
     before: BTreeSet<PeerId>,
 ) {
-    reaches(publishers, 1).await;
     let Some(hearing) = bus.hearing() else {
+        // Both know of each other then; another node may publish the same topic.
+        let mut publishers = publishers;
+        let _ = publishers.wait_for(|now| now.has_node(node)).await;
         return;
     };
+    reaches(publishers, 1).await;
     let mut pause = LOOK;
     loop {
         let Ok(now) = hearing.heard_over(topic).await else {

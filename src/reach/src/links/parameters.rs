@@ -9,7 +9,8 @@ use ros::ros1::own_parameters::is_of_master;
 use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
-use super::{Hub, RUNS};
+use super::Hub;
+use super::runs::RUNS;
 use link::control::{FromCloud, Hello, Node};
 
 /// Stamps are simulated time.
@@ -40,6 +41,7 @@ impl Drop for Known {
 impl Known {
     /// Takes over all of the robot's parameters, those that the deployer gave last.
     pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
+        // A robot of ROS 2, which has no other parameters, tells this one of its node's.
         let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
         hub.skew.leave(hello.keep_stamps || simulated);
         let Ok(parameters) = hub.bus.parameters() else {

@@ -28,7 +28,7 @@ impl Quiet {
 
 #[async_trait]
 impl Nodes for Quiet {
-    async fn start(&self, node: &Node) -> Result<(), String> {
+    async fn start(&self, node: &Node, _: &str) -> Result<(), String> {
         if self.is_stuck(&node.name) {
             std::future::pending::<()>().await;
         }
@@ -156,6 +156,30 @@ async fn a_hello_that_was_overtaken_does_not_displace_the_later_one() {
     let (_fourth, welcome) = says(&hub, &resuming(4, &welcome)).await;
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
     closed(third).await;
+}
+
+#[tokio::test]
+async fn a_robot_of_another_ros_is_refused_for_good() {
+    let (hub, nodes) = hub().await;
+    for (ros, refused) in [(0, false), (1, false), (2, true), (3, true)] {
+        let hello = Hello {
+            ros,
+            run: format!("life in ROS {ros}"),
+            ..hello("/detect", 1)
+        };
+        match says(&hub, &hello).await.1 {
+            Welcome::Accepted { .. } => assert!(!refused, "{ros}"),
+            Welcome::Refused { reason, again } => {
+                assert!(refused && !again, "{reason}");
+                let told = format!("servant s1 is of ROS 1 and this robot is of ROS {ros}");
+                assert!(reason.contains(&told), "{reason}");
+            }
+        }
+    }
+    assert!(
+        nodes.is_running("/detect").await,
+        "it is not ended for them"
+    );
 }
 
 #[tokio::test]

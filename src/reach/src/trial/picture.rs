@@ -7,10 +7,12 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use bytes::Bytes;
 use png::{ColorType, Decoder, Limits, Transformations};
 
+use ros::bus::RosVersion;
+
 use crate::Error;
 
-/// What becomes of it.
-pub const TYPE: &str = "sensor_msgs/Image";
+/// What becomes of it, by the names that both ROSes have for it.
+pub const TYPES: [&str; 2] = ["sensor_msgs/Image", "sensor_msgs/msg/Image"];
 const SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
 /// The largest picture, decoded; and as much as several may have together.
 const MAX_BYTES: usize = 128 << 20;
@@ -93,7 +95,41 @@ impl Picture {
     }
 
     /// The message, taken now. (sensor_msgs/Image: header, height, width, encoding, is_bigendian, step, data.)
-    pub fn message(&self, sequence: usize) -> Bytes {
+    pub fn message(&self, sequence: usize, ros: RosVersion) -> Bytes {
+        match ros {
+            RosVersion::One => self.of_ros_1(sequence),
+            RosVersion::Two => self.of_ros_2(),
+        }
+    }
+
+    /// CDR: numbers are aligned to their size behind the header of four bytes, texts end with a zero that counts.
+    fn of_ros_2(&self) -> Bytes {
+        const HEADER: [u8; 4] = [0, 1, 0, 0];
+        let now = SystemTime::now()
+            .duration_since(UNIX_EPOCH)
+            .unwrap_or_default();
+        let mut out = Vec::with_capacity(self.rgb.len() + 64);
+        out.extend_from_slice(&HEADER);
+        let mut word = |value: u32, text: &str| {
+            // The header's length is a multiple of four, too.
+            out.resize(out.len().next_multiple_of(4), 0);
+            out.extend_from_slice(&value.to_le_bytes());
+            out.extend_from_slice(text.as_bytes());
+        };
+        word(now.as_secs() as u32, "");
+        word(now.subsec_nanos(), "");
+        word(7, "camera\0");
+        word(self.height, "");
+        word(self.width, "");
+        // Behind the text: it is little endian.
+        word(5, "rgb8\0\0");
+        word(self.width * 3, "");
+        word(self.rgb.len() as u32, "");
+        out.extend_from_slice(&self.rgb);
+        out.into()
+    }
+
+    fn of_ros_1(&self, sequence: usize) -> Bytes {
         let now = SystemTime::now()
             .duration_since(UNIX_EPOCH)
             .unwrap_or_default();
@@ -136,6 +172,9 @@ fn length(files: &[u8]) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
+    use ros::codec::{JsonOptions, to_json};
+    use ros::schema::Registry;
+
     use super::*;
 
     fn png(pixels: &[u8]) -> Vec<u8> {
@@ -168,8 +207,41 @@ mod tests {
         let file = png(&[7, 9]);
         let picture = Picture::read(&file).expect("a picture");
         assert_eq!(picture.rgb[..], [7, 7, 7, 9, 9, 9]);
-        let message = picture.message(3);
+        let message = picture.message(3, RosVersion::One);
         assert!(message.ends_with(&[6, 0, 0, 0, 6, 0, 0, 0, 7, 7, 7, 9, 9, 9]));
+    }
+
+    #[test]
+    fn a_picture_is_an_image_of_ros_2_too() {
+        let definitions = [
+            (
+                "sensor_msgs/msg/Image",
+                "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
+                 uint32 step\nuint8[] data\n",
+            ),
+            (
+                "std_msgs/msg/Header",
+                "builtin_interfaces/Time stamp\nstring frame_id\n",
+            ),
+        ];
+        let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
+        let registry = Registry::of_definitions(RosVersion::Two, &definitions.into());
+        let image = registry
+            .expect("valid")
+            .message("sensor_msgs/msg/Image")
+            .expect("defined");
+        let picture = Picture::read(&png(&[7, 9])).expect("a picture");
+        let message = picture.message(0, RosVersion::Two);
+        let mut json = Vec::new();
+        to_json(&image, &message, &mut json, &JsonOptions::default()).expect("valid");
+        let seen: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
+        assert_eq!(seen["header"]["frame_id"], "camera");
+        assert_eq!((&seen["height"], &seen["width"]), (&1.into(), &2.into()));
+        assert_eq!(
+            (&seen["encoding"], &seen["step"]),
+            (&"rgb8".into(), &6.into())
+        );
+        assert_eq!(seen["data"], "BwcHCQkJ");
     }
 
     #[test]

@@ -6,11 +6,11 @@ use std::time::Duration;
 use bytes::Bytes;
 use package::interface::{Direction, Interface, Topic};
 use ros::bag::Recorded;
-use ros::bus::WireType;
+use ros::bus::{Qos, RosVersion, WireType};
 use ros::codec::{Time, header_stamp};
 use ros::schema::Registry;
 
-use super::{Material, Picture, picture};
+use super::{Material, Picture, QUEUE, picture};
 use crate::Error;
 
 /// Longer pauses of a recording are cut to this.
@@ -18,7 +18,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
 /// The inputs, and the messages in their order.
 pub(super) struct Plan<'a> {
-    pub(super) inputs: Vec<(String, WireType)>,
+    pub(super) inputs: Vec<Input>,
     /// The input whose messages are requests.
     pub(super) request: usize,
     pub(super) items: Vec<Item<'a>>,
@@ -27,6 +27,29 @@ pub(super) struct Plan<'a> {
     pub(super) unused: Vec<String>,
     /// Recorded topics of other names than the input of this number that they go to.
     pub(super) renamed: BTreeSet<(usize, String)>,
+}
+
+/// Where messages go.
+pub(super) struct Input {
+    pub(super) topic: String,
+    pub(super) wire_type: WireType,
+    /// What its nodes ask for, as far as that is known.
+    pub(super) qos: Qos,
+}
+
+impl Input {
+    fn of(topic: &Topic, registry: &Registry) -> Result<Input, Error> {
+        let plain = Qos::keep_last(QUEUE);
+        Ok(Input {
+            topic: topic.name.clone(),
+            wire_type: wire_type(registry, topic)?,
+            qos: topic.qos.map_or(plain, |qos| Qos {
+                // Nothing of what is given may be lost.
+                reliability: plain.reliability,
+                ..qos.on_bus(QUEUE)
+            }),
+        })
+    }
 }
 
 /// One message.
@@ -45,10 +68,10 @@ pub(super) enum Content<'a> {
 
 impl Content<'_> {
     /// The message; a picture is taken now.
-    pub(super) fn message(&self, sequence: usize) -> Bytes {
+    pub(super) fn message(&self, sequence: usize, ros: RosVersion) -> Bytes {
         match self {
             Content::Recorded(bytes) => bytes.clone(),
-            Content::Picture(picture) => picture.message(sequence),
+            Content::Picture(picture) => picture.message(sequence, ros),
         }
     }
 }
@@ -93,10 +116,9 @@ impl<'a> Plan<'a> {
             Material::Pictures(pictures) => {
                 let eyes = inputs
                     .iter()
-                    .filter(|topic| topic.type_name == picture::TYPE);
+                    .filter(|topic| picture::TYPES.contains(&topic.type_name.as_str()));
                 for topic in eyes {
-                    plan.inputs
-                        .push((topic.name.clone(), wire_type(registry, topic)?));
+                    plan.inputs.push(Input::of(topic, registry)?);
                 }
                 if plan.inputs.is_empty() {
                     return Err(nothing("the service takes no sensor_msgs/Image"));
@@ -121,7 +143,7 @@ impl<'a> Plan<'a> {
                 for message in recorded {
                     match plan.place(&inputs, registry, message)? {
                         Some(input) => {
-                            if plan.inputs[input].0 != *message.topic {
+                            if plan.inputs[input].topic != *message.topic {
                                 plan.renamed.insert((input, message.topic.to_string()));
                             }
                             let pause = message.time.saturating_sub(before.unwrap_or(message.time));
@@ -181,13 +203,13 @@ impl<'a> Plan<'a> {
 
     /// The stamp of a message of an input.
     pub(super) fn stamp(&self, input: usize, bytes: &[u8], registry: &Registry) -> Option<Time> {
-        stamp(&self.inputs[input].1.name, bytes, registry)
+        stamp(&self.inputs[input].wire_type.name, bytes, registry)
     }
 
     fn choose(&mut self, request: Option<&str>) -> Option<()> {
         if let Some(named) = request {
             let mut inputs = self.inputs.iter();
-            self.request = inputs.position(|(topic, _)| topic == named)?;
+            self.request = inputs.position(|input| input.topic == named)?;
         }
         Some(())
     }
@@ -212,18 +234,19 @@ impl<'a> Plan<'a> {
         if let Some(known) = self
             .inputs
             .iter()
-            .position(|(topic, _)| *topic == input.name)
+            .position(|known| known.topic == input.name)
         {
             return Ok(Some(known));
         }
-        let wire_type = wire_type(registry, input)?;
-        if wire_type.digest != message.wire_type.digest {
+        let found = Input::of(input, registry)?;
+        let wire_type = &found.wire_type;
+        if !wire_type.agrees(&message.wire_type) {
             return Err(Error::Trial(format!(
                 "{} was recorded with another definition of {} ({}) than the service has ({})",
                 message.topic, wire_type.name, message.wire_type.digest, wire_type.digest
             )));
         }
-        self.inputs.push((input.name.clone(), wire_type));
+        self.inputs.push(found);
         Ok(Some(self.inputs.len() - 1))
     }
 }
@@ -275,6 +298,7 @@ mod tests {
             nodes: vec![],
             latched: false,
             lazy: false,
+            qos: None,
         };
         Interface {
             topics: vec![
@@ -318,7 +342,10 @@ mod tests {
         ]);
         let plan = plan(&material, None).expect("a plan");
         assert_eq!(plan.inputs.len(), 1);
-        assert_eq!((plan.inputs[0].0.as_str(), plan.items.len()), ("/name", 2));
+        assert_eq!(
+            (plan.inputs[0].topic.as_str(), plan.items.len()),
+            ("/name", 2)
+        );
         assert_eq!(plan.unused, ["/tf"]);
         assert_eq!(plan.recorded_for(0), ["/chatter"]);
     }
@@ -344,6 +371,32 @@ mod tests {
         assert!(text.contains("recorded with another definition"), "{text}");
         let text = refused(recorded("/name", "std_msgs/String", STRING), Some("/count"));
         assert!(text.contains("goes to an input /count"), "{text}");
+    }
+
+    #[test]
+    fn an_input_of_ros_2_is_given_what_it_asks_for() {
+        let qos = package::interface::Qos {
+            durability: package::interface::Durability::TransientLocal,
+            ..Default::default()
+        };
+        let mut interface = interface();
+        interface.topics.truncate(1);
+        interface.topics[0].type_name = "std_msgs/msg/String".into();
+        interface.topics[0].qos = Some(qos);
+        let registry = Registry::of_definitions(RosVersion::Two, &interface.definitions);
+        let registry = registry.expect("valid");
+        let of = WireType::of(&registry.message("std_msgs/msg/String").expect("defined"));
+        let material = Material::Bag(vec![Recorded {
+            wire_type: Arc::new(of),
+            ..recorded("/name", "", "")
+        }]);
+        let plan = Plan::new(&interface, &registry, &material, None).expect("a plan");
+        assert!(plan.inputs[0].qos.is_latching());
+        // Of the other ROS.
+        let material = Material::Bag(vec![recorded("/name", "std_msgs/String", STRING)]);
+        let refused = Plan::new(&interface, &registry, &material, None).err();
+        let words = refused.map(|error| error.to_string()).unwrap_or_default();
+        assert!(words.contains("/name is std_msgs/String there"), "{words}");
     }
 
     #[test]

@@ -15,7 +15,7 @@ const NODE: &str = "/cloudroid_bridge";
 const ACTION: &str = "/fib";
 const SCRIPT: &str = "fibonacci.py";
 
-fn fibonacci() -> Arc<ActionDef> {
+pub fn fibonacci() -> Arc<ActionDef> {
     let registry = Registry::of(RosVersion::Two);
     let text = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
     let inserted = registry.insert("test_msgs/action/Fibonacci", text);

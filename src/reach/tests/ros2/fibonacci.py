@@ -21,7 +21,9 @@ from test_msgs.action import Fibonacci, NestedMessage
 
 
 def say(*what):
-    print(json.dumps(what), flush=True)
+    # In one piece: several threads may have something to say.
+    sys.stdout.write(json.dumps(what) + '\n')
+    sys.stdout.flush()
 
 
 class Server(Node):

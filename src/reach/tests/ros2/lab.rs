@@ -10,12 +10,12 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::JoinOptions;
 use ros::bus::{Bus, RosVersion, ServiceType, WireType};
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::Sockets;
 use ros::ros2::Ros2Bus;
 use ros::schema::{MessageType, Registry, ServiceDef};
+use ros::{Interface, JoinOptions, Network};
 use serde_json::Value;
 use servant::netns::NetNs;
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader, Lines};
@@ -46,6 +46,10 @@ impl Sockets for Inside {
         self.0.datagrams(address, shared).await
     }
 
+    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+        self.0.run(ros::net::interfaces).map_err(io::Error::other)?
+    }
+
     async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
         self.0.diagnostics().await.map(Some)
     }
@@ -53,7 +57,7 @@ impl Sockets for Inside {
 
 /// A network with nothing but `lo`.
 pub struct Lab {
-    network: Arc<NetNs>,
+    pub network: Arc<NetNs>,
 }
 
 impl Lab {
@@ -66,8 +70,17 @@ impl Lab {
 
     /// Our node of this name.
     pub async fn join(&self, node: &str) -> Arc<Ros2Bus> {
+        self.join_network(node, Network::default()).await
+    }
+
+    /// The same, where more than `lo` is meant.
+    pub async fn join_network(&self, node: &str, network: Network) -> Arc<Ros2Bus> {
         let sockets = Arc::new(Inside(Arc::clone(&self.network)));
-        let joined = Ros2Bus::connect(sockets, JoinOptions::in_domain(0, node)).await;
+        let options = JoinOptions {
+            network,
+            ..JoinOptions::in_domain(0, node)
+        };
+        let joined = Ros2Bus::connect(sockets, options).await;
         joined.expect("a bus")
     }
 
@@ -78,6 +91,16 @@ impl Lab {
 
     /// A node of a program beside this file, once it is ready.
     pub async fn node(&self, program: &str, arguments: &[&str]) -> Peer {
+        self.node_with(program, arguments, &[]).await
+    }
+
+    /// The same, with these variables in its environment.
+    pub async fn node_with(
+        &self,
+        program: &str,
+        arguments: &[&str],
+        environment: &[(&str, &str)],
+    ) -> Peer {
         let prefix = std::env::var_os("CLOUDROID_ROS2_PREFIX");
         let prefix = prefix.expect(
             "CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test",
@@ -92,6 +115,7 @@ impl Lab {
             .arg(script)
             .args(arguments)
             .env("ROS_DOMAIN_ID", "0")
+            .envs(environment.iter().copied())
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .kill_on_drop(true);

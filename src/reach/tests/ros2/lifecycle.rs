@@ -1,7 +1,9 @@
 use std::sync::Arc;
 
 use ros::bus::{Bus, ParamValue};
-use ros::ros2::lifecycle::{LifecycleNode, State, StateChange, StateChanges, Transition};
+use ros::ros2::lifecycle::{
+    Begun, LifecycleNode, State, StateChange, StateChanges, Transition, begin_all,
+};
 use tokio::time::timeout;
 
 use super::lab::{LONG, Lab};
@@ -51,4 +53,47 @@ async fn a_node_is_configured_and_activated() {
     assert_eq!(node.state().await.unwrap(), State::Active);
     node.change(Transition::Shutdown, LONG).await.unwrap();
     assert_eq!(node.state().await.unwrap(), State::Finalized);
+}
+
+#[tokio::test]
+async fn a_node_begins_when_nobody_else_drives_it() {
+    let lab = Lab::new();
+    let (bus, _nodes) = tuned(&lab).await;
+    let shown: Arc<dyn Bus> = bus.clone();
+    let parameters = bus.node_parameters().unwrap();
+    let broken = |value| vec![("broken".to_owned(), Some(ParamValue::Bool(value)))];
+    parameters.set(STAGED, broken(true)).await.unwrap();
+    let refused = begin_all(&shown, LONG).await.unwrap_err();
+    assert_eq!(
+        (&*refused.node, refused.transition),
+        (STAGED, Transition::Activate)
+    );
+    // It was configured by then: what is past its beginning is left to who brought it there.
+    let all = begin_all(&shown, LONG).await.unwrap();
+    assert_eq!(all, [(STAGED.to_owned(), Begun::Left(State::Inactive))]);
+
+    let lab = Lab::new();
+    let (bus, _nodes) = tuned(&lab).await;
+    let shown: Arc<dyn Bus> = bus.clone();
+    // Somebody has a client of it, and so may drive it.
+    let manager = lab.join("/manager").await;
+    let driving = LifecycleNode::of(manager.clone(), STAGED);
+    assert_eq!(driving.state().await.unwrap(), State::Unconfigured);
+    let known = driving.change(Transition::Activate, LONG).await;
+    known.expect_err("it is not configured");
+    let driven = |graph: &ros::bus::Graph| {
+        let ends = graph.ends.get("/manager");
+        ends.is_some_and(|ends| ends.clients.contains_key("/lab/staged/change_state"))
+    };
+    super::lab::shows(&bus, driven).await;
+    let all = begin_all(&shown, LONG).await.unwrap();
+    let driver = Begun::DrivenBy("/manager".to_owned());
+    assert_eq!(all, [(STAGED.to_owned(), driver)]);
+
+    manager.close().await;
+    super::lab::shows(&bus, |graph| !driven(graph)).await;
+    let all = begin_all(&shown, LONG).await.unwrap();
+    assert_eq!(all, [(STAGED.to_owned(), Begun::Now)]);
+    let node = LifecycleNode::of(shown, STAGED);
+    assert_eq!(node.state().await.unwrap(), State::Active);
 }

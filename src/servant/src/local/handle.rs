@@ -420,6 +420,10 @@ impl Servant for LocalServant {
         self.known.nodes.borrow().keys().cloned().collect()
     }
 
+    fn run(&self, node: &str) -> Option<String> {
+        self.known.nodes.borrow().get(node)?.run.clone()
+    }
+
     async fn start_node(&self, node: NodeSpec) -> Result<(), Error> {
         self.ask(Command::StartNode(node)).await
     }

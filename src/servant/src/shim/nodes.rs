@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use crate::engine::{NodeEvent, NodeExit};
 use crate::protocol::NodeStatus;
-use crate::spec::NodeSpec;
+use crate::spec::{NodeSpec, RUN};
 
 /// One node.
 #[derive(Debug)]
@@ -67,6 +67,7 @@ impl Nodes {
             .map_or(0, |node| node.status.starts);
         let status = NodeStatus {
             starts,
+            run: spec.environment.get(RUN).cloned(),
             ..NodeStatus::default()
         };
         self.known.insert(
@@ -318,6 +319,23 @@ mod tests {
                 })
                 .is_err()
         );
+    }
+
+    #[test]
+    fn it_is_known_for_which_run_a_node_was_started_last() {
+        let mut nodes = Nodes::default();
+        for (life, inside) in [("first life", 2), ("second life", 3)] {
+            let environment = BTreeMap::from([(RUN.to_owned(), life.to_owned())]);
+            let spec = NodeSpec {
+                environment,
+                ..node("/see", false, false)
+            };
+            run(&mut nodes, spec, inside);
+            assert_eq!(nodes.status("/see").run.as_deref(), Some(life));
+            nodes.exited(inside, exit_of(0, false)).unwrap();
+        }
+        run(&mut nodes, node("/planned", false, false), 4);
+        assert_eq!(nodes.status("/planned").run, None);
     }
 
     #[test]

@@ -1,0 +1,185 @@
+//! Nodes of a servant that have a lifecycle (ROS 2): those that nobody else drives are had to configure and activate
+//! themselves as they appear, and in which state each is can be told.
+//!
+//! ```text
+//!  graph ─▶ a node with a lifecycle ─▶ started by a stub? driven by a manager? past unconfigured? ─yes─▶ left alone ─┐
+//!                                                   │ no                                                           ▼
+//!                                                   └─▶ configure ─▶ activate ─▶ or the event lifecycle-refused ─▶ state
+//! ```
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros::bus::{Bus, RosVersion};
+use ros::ros2::lifecycle::{Begun, LifecycleNode, State};
+use tokio::sync::watch;
+use tokio::task::{AbortHandle, JoinSet};
+
+use crate::Observer;
+use crate::links::Nodes;
+
+/// For one transition: nodes load what they need then.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// What the names of the daemon's own nodes begin with.
+const OURS: &str = "/cloudroid_";
+
+/// Where a node is in its lifecycle.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stage {
+    /// In ROS's own word: `active`.
+    pub state: String,
+    /// Why it is not active: it was told to be, and did not become it.
+    pub refused: Option<String>,
+}
+
+/// Nodes that have a lifecycle, by name.
+pub type Stages = BTreeMap<String, Stage>;
+
+/// Has nodes begin until it is dropped.
+pub(crate) struct Lifecycles {
+    shown: watch::Receiver<Stages>,
+    task: AbortHandle,
+}
+
+impl Drop for Lifecycles {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl Lifecycles {
+    /// Follows the nodes of a servant; none where its ROS has no lifecycles. `nodes`: those that stubs have started are for the
+    /// robot to drive.
+    pub(crate) fn follow(
+        bus: &Arc<dyn Bus>,
+        nodes: &Arc<dyn Nodes>,
+        observer: &Arc<dyn Observer>,
+    ) -> Option<Lifecycles> {
+        if bus.version() == RosVersion::One {
+            return None;
+        }
+        let shown = watch::Sender::default();
+        let followed = Followed {
+            bus: Arc::clone(bus),
+            nodes: Arc::clone(nodes),
+            observer: Arc::clone(observer),
+            shown,
+        };
+        Some(Lifecycles {
+            shown: followed.shown.subscribe(),
+            task: tokio::spawn(Arc::new(followed).run()).abort_handle(),
+        })
+    }
+
+    /// Those that there are, now and later.
+    pub(crate) fn stages(&self) -> watch::Receiver<Stages> {
+        self.shown.clone()
+    }
+}
+
+struct Followed {
+    bus: Arc<dyn Bus>,
+    nodes: Arc<dyn Nodes>,
+    observer: Arc<dyn Observer>,
+    shown: watch::Sender<Stages>,
+}
+
+impl Followed {
+    async fn run(self: Arc<Self>) {
+        let mut graph = self.bus.graph();
+        // By name and address: a node that was started again begins again.
+        let mut known: HashMap<(String, String), AbortHandle> = HashMap::new();
+        // They end with this.
+        let mut tasks = JoinSet::new();
+        loop {
+            let now = Arc::clone(&graph.borrow_and_update());
+            let there = LifecycleNode::all(&now).into_iter().filter_map(|node| {
+                let address = now.nodes.get(&node)?.clone();
+                (node != self.bus.node()).then_some((node, address))
+            });
+            let there: Vec<_> = there.collect();
+            known.retain(|one, task| {
+                let stays = there.contains(one);
+                if !stays {
+                    task.abort();
+                    self.shown.send_modify(|all| drop(all.remove(&one.0)));
+                }
+                stays
+            });
+            while tasks.try_join_next().is_some() {}
+            for one in there {
+                let node = one.0.clone();
+                let followed = &self;
+                known
+                    .entry(one)
+                    .or_insert_with(|| tasks.spawn(Arc::clone(followed).one(node)));
+            }
+            if graph.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    /// Has one node begin, if that is ours to do, and tells its states from then on.
+    async fn one(self: Arc<Self>, name: String) {
+        let node = LifecycleNode::of(Arc::clone(&self.bus), &name);
+        let linked = self.nodes.running().await;
+        if !linked.iter().any(|linked| linked.node.name == name) {
+            self.begin(&node, &name).await;
+        }
+        let changes = node.watch().await;
+        match node.state().await {
+            Ok(state) => self.show(&name, state),
+            Err(error) => tracing::debug!(node = name, %error, "its state is not known"),
+        }
+        match changes {
+            Ok(mut changes) => {
+                while let Some(change) = changes.next().await {
+                    self.show(&name, change.to);
+                }
+            }
+            Err(error) => tracing::debug!(node = name, %error, "it tells no changes of its state"),
+        }
+    }
+
+    async fn begin(&self, node: &LifecycleNode, name: &str) {
+        let ours = |other: &str| other.starts_with(OURS);
+        match node.begin(&ours, PATIENCE).await {
+            Ok(Begun::Now) => self.show(name, State::Active),
+            Ok(Begun::Left(state)) => self.show(name, state),
+            Ok(Begun::DrivenBy(driver)) => {
+                tracing::debug!(node = name, driver, "somebody drives it");
+            }
+            Err(refused) => {
+                let why = refused.to_string();
+                let observer = &self.observer;
+                observer.event(api::Level::Error, "lifecycle-refused", &why, None);
+                self.shown.send_modify(|all| {
+                    let stage = Stage {
+                        state: State::Unknown.to_string(),
+                        refused: Some(why),
+                    };
+                    all.insert(name.to_owned(), stage);
+                });
+            }
+        }
+    }
+
+    /// What was refused stands until the node is active: somebody else may have it become that.
+    fn show(&self, name: &str, state: State) {
+        self.shown.send_if_modified(|all| {
+            let before = all.get(name);
+            let refused = before.and_then(|before| before.refused.clone());
+            let now = Stage {
+                state: state.to_string(),
+                refused: refused.filter(|_| state != State::Active),
+            };
+            let news = before != Some(&now);
+            if news {
+                all.insert(name.to_owned(), now);
+            }
+            news
+        });
+    }
+}
