@@ -35,12 +35,6 @@ pub enum Error {
         /// The reason.
         reason: String,
     },
-    /// Stubs are ROS 1's so far: a robot's own nodes and the service's would not understand each other.
-    #[error("service {service} is of ROS 2, for which there is no stub")]
-    StubOfRos2 {
-        /// The service.
-        service: String,
-    },
     /// The robot's program is not held for an architecture.
     #[error("this server holds no cloudroid-stub for {asked:?}")]
     UnknownArchitecture {

@@ -65,6 +65,7 @@ mod tests {
             nodes: vec![],
             latched: false,
             lazy: false,
+            qos: None,
         };
         RevisionRecord {
             service: "s".into(),

@@ -1,6 +1,6 @@
 //! Stubs of published services: composed from the image and the interface, packed with the robot's program.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,6 @@ use package::stub::{
     manifest,
 };
 use ros::bus::RosVersion;
-use ros::flavour::Flavour;
 use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
@@ -99,16 +98,6 @@ pub fn is_authority(text: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
-/// Refuses a service of a ROS for which there is no stub.
-pub fn check_ros(service: &str, flavour: &Flavour) -> Result<(), Error> {
-    match flavour.ros.bus() {
-        RosVersion::One => Ok(()),
-        RosVersion::Two => Err(Error::StubOfRos2 {
-            service: service.to_owned(),
-        }),
-    }
-}
-
 /// The files of a revision's stub, but for the robot's program.
 pub fn files(
     store: &image::Store,
@@ -117,7 +106,6 @@ pub fn files(
     architecture: &str,
     portal: &Portal,
 ) -> Result<Files, Error> {
-    check_ros(&revision.service, &revision.flavour)?;
     let no_stub = |error: package::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: error.to_string(),
@@ -128,6 +116,7 @@ pub fn files(
         None => Contents::default(),
     };
     let about = About {
+        ros: revision.flavour.ros.bus(),
         service: &revision.service,
         package: &revision.package,
         revision: revision.number,
@@ -135,11 +124,30 @@ pub fn files(
         portal,
         architecture,
         outsourced: &inventory.programs.keys().cloned().collect(),
+        names: &names(revision, inventory),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
         times: times(&revision.plan.sla),
     };
     compose(&about, contents).map_err(no_stub)
+}
+
+/// What nodes of ROS 2 are called by their programs, where each runs once: a robot's launch files seldom name its nodes, and
+/// parameters files go by what those are called. ROS 1's always name them.
+fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
+    let mut names = BTreeMap::new();
+    if revision.flavour.ros.bus() == RosVersion::One {
+        return names;
+    }
+    for (program, path) in &inventory.programs {
+        let nodes = revision.plan.nodes.iter();
+        let mut nodes = nodes.filter(|node| node.argv.contains(path));
+        if let (Some(node), None) = (nodes.next(), nodes.next()) {
+            let name = node.name.rsplit('/').next().unwrap_or(&node.name);
+            names.insert(program.clone(), name.to_owned());
+        }
+    }
+    names
 }
 
 /// T_desire and T_max in seconds; where one of them is given it is both.
@@ -258,7 +266,10 @@ fn header(kind: EntryType, executable: bool, size: u64) -> Header {
 mod tests {
     use std::io::Read;
 
-    use ros::flavour::Version;
+    use package::interface::Interface;
+    use ros::flavour::{Flavour, Version};
+    use servant::spec::NodeSpec;
+    use store::Plan;
 
     use super::*;
 
@@ -280,17 +291,48 @@ mod tests {
     }
 
     #[test]
-    fn there_is_no_stub_of_a_service_of_ros_2() {
-        let of = |ros| Flavour {
-            ros,
-            ..Flavour::default()
+    fn nodes_of_ros_2_are_called_as_their_programs_call_them() {
+        let node = |name: &str, program: &str| NodeSpec {
+            name: name.into(),
+            argv: vec![program.into(), "--fast".into()],
+            environment: BTreeMap::new(),
+            directory: String::new(),
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
         };
-        assert!(check_ros("one", &of(Version::Ros1)).is_ok());
-        let refused = check_ros("two", &of(Version::Ros2)).expect_err("another ROS");
-        assert_eq!(
-            refused.to_string(),
-            "service two is of ROS 2, for which there is no stub"
-        );
+        let mut revision = RevisionRecord {
+            service: "s".into(),
+            number: 1,
+            image: String::new(),
+            published: 0,
+            package: "p".into(),
+            source: String::new(),
+            flavour: Flavour {
+                ros: Version::Ros2,
+                ..Flavour::default()
+            },
+            plan: Plan {
+                nodes: vec![
+                    node("/front/camera", "/opt/p/lib/p/camera_node"),
+                    node("/left", "/opt/p/lib/p/wheel"),
+                    node("/right", "/opt/p/lib/p/wheel"),
+                ],
+                ..Plan::default()
+            },
+            interface: Interface::default(),
+        };
+        let inventory = Inventory {
+            programs: ["camera_node", "wheel"]
+                .map(|name| (name.to_owned(), format!("/opt/p/lib/p/{name}")))
+                .into(),
+            ..Inventory::default()
+        };
+        // What runs twice says nothing of its own name.
+        let expected = [("camera_node".to_owned(), "camera".to_owned())];
+        assert_eq!(names(&revision, &inventory), expected.into());
+        revision.flavour.ros = Version::Ros1;
+        assert!(names(&revision, &inventory).is_empty());
     }
 
     #[test]

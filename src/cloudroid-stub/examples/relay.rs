@@ -1,6 +1,9 @@
-//! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting from a sibling's parameter before it;
-//! `~echo` answers with its request. `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` comes, what
-//! that service answers leaves. `patient`: it listens once it is heard.
+//! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting before it; `~echo` answers with its request.
+//! `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` comes, what that service answers leaves. `patient`: it
+//! listens once it is heard. `keeps`: it wants what was said before, too.
+//!
+//! In ROS 1 the greeting is a sibling's parameter. With `--ros-args` it is a node of ROS 2, the greeting is a parameter of its own,
+//! and there is an action, `count`, whose goals are their results.
 //!
 //! The tests of the local original start it in place of one.
 
@@ -9,10 +12,15 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, GlobalParameters, ParamValue, Qos, ServiceHandler, ServiceType, WireType};
+use ros::JoinOptions;
+use ros::bus::{
+    ActionHandler, ActionServer, Bus, GoalEnd, Outcome, ParamValue, Qos, RosVersion,
+    ServiceHandler, ServiceType, WireType,
+};
 use ros::net::{HostSockets, Sockets};
-use ros::ros1::Ros1Bus;
 use ros::ros1::names::{self, PeerUri};
+use ros::schema::Registry;
+use tokio::sync::mpsc;
 
 struct Echo;
 
@@ -23,14 +31,82 @@ impl ServiceHandler for Echo {
     }
 }
 
+/// Passes goals on, to be ended.
+struct Goals(mpsc::UnboundedSender<(String, Bytes)>);
+
+impl ActionHandler for Goals {
+    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+        let sent = self.0.send((id.to_owned(), goal));
+        sent.map_err(|error| error.to_string())
+    }
+    fn cancel(&self, _: &str) {}
+    fn failed(&self, reason: &str) {
+        eprintln!("{reason}");
+    }
+}
+
+/// A server, and the goals that are sent to it.
+type Counting = (
+    Box<dyn ActionServer>,
+    mpsc::UnboundedReceiver<(String, Bytes)>,
+);
+
+fn count(bus: &dyn Bus, action: &str) -> Result<Counting, Box<dyn std::error::Error>> {
+    let registry = Registry::of(RosVersion::Two);
+    let text = "int32 number\n---\nint32 number\n---\nint32 number\n";
+    registry.insert("tests/action/Count", text)?;
+    let (sender, goals) = mpsc::unbounded_channel();
+    let of = registry.action("tests/action/Count")?;
+    let server = bus.serve_action(action, &of, Arc::new(Goals(sender)))?;
+    Ok((server, goals))
+}
+
+/// Where the message begins: behind CDR's header in ROS 2.
+fn begin(bus: &dyn Bus) -> usize {
+    match bus.version() {
+        RosVersion::One => 0,
+        RosVersion::Two => 4,
+    }
+}
+
+fn read(bus: &dyn Bus, message: &[u8]) -> String {
+    let text = &message[begin(bus) + 4..];
+    let text = String::from_utf8_lossy(text).into_owned();
+    text.trim_end_matches('\0').to_owned()
+}
+
+fn written(bus: &dyn Bus, text: &str) -> Result<Bytes, Box<dyn std::error::Error>> {
+    let (header, end): (&[u8], &[u8]) = match bus.version() {
+        RosVersion::One => (&[], &[]),
+        RosVersion::Two => (&[0, 1, 0, 0], &[0]),
+    };
+    let length = u32::try_from(text.len() + end.len())?.to_le_bytes();
+    Ok([header, &length, text.as_bytes(), end].concat().into())
+}
+
 async fn asked(bus: &dyn Bus, service: &str) -> String {
-    match bus
-        .call(service, Bytes::new(), Duration::from_secs(20))
-        .await
-    {
-        Ok(answer) => String::from_utf8_lossy(&answer).into_owned(),
+    let request = match bus.version() {
+        RosVersion::One => Bytes::new(),
+        RosVersion::Two => Bytes::from_static(&[0, 1, 0, 0, 0]),
+    };
+    match bus.call(service, request, Duration::from_secs(20)).await {
+        Ok(answer) => String::from_utf8_lossy(&answer[begin(bus)..]).into_owned(),
         Err(error) => error.to_string(),
     }
+}
+
+/// Joins the system that the environment tells of.
+async fn join(version: RosVersion, node: &str) -> Result<Arc<dyn Bus>, Box<dyn std::error::Error>> {
+    let options = match version {
+        RosVersion::One => {
+            let master = std::env::var("ROS_MASTER_URI")?;
+            let master = PeerUri::parse(&master, "http").ok_or("ROS_MASTER_URI")?;
+            let master = HostSockets.resolve(&master.host, master.port).await?;
+            JoinOptions::new(master, node)
+        }
+        RosVersion::Two => JoinOptions::in_domain(std::env::var("ROS_DOMAIN_ID")?.parse()?, node),
+    };
+    Ok(ros::connect(version, Arc::new(HostSockets), options).await?)
 }
 
 #[tokio::main(flavor = "current_thread")]
@@ -44,29 +120,43 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             .find_map(|argument| argument.strip_prefix(&prefix))
             .map(str::to_owned)
     };
+    let version = match arguments.iter().any(|argument| argument == "--ros-args") {
+        true => RosVersion::Two,
+        false => RosVersion::One,
+    };
     let namespace = std::env::var("ROS_NAMESPACE").unwrap_or_default();
-    let name = given("__name").unwrap_or_else(|| "relay".into());
+    let namespace = given("__ns").unwrap_or(namespace);
+    let name = given("__node").or_else(|| given("__name"));
+    let name = name.unwrap_or_else(|| "relay".into());
     let node = names::canonical(&format!("{namespace}/{name}"));
     let topic = |name: &str| names::resolve(&given(name).unwrap_or_else(|| name.into()), &node);
     let crash = arguments
         .iter()
         .find_map(|argument| argument.strip_prefix("crash-on="));
 
-    let master =
-        PeerUri::parse(&std::env::var("ROS_MASTER_URI")?, "http").ok_or("ROS_MASTER_URI")?;
-    let master = HostSockets.resolve(&master.host, master.port).await?;
-    let bus = Ros1Bus::connect(Arc::new(HostSockets), master, &node).await?;
-    let greeting = match bus.get(&format!("{node}_sibling/greeting")).await {
-        Ok(ParamValue::String(greeting)) => greeting,
-        _ => String::new(),
+    let bus = join(version, &node).await?;
+    let greeting = match bus.parameters() {
+        Ok(parameters) => {
+            let greeting = parameters.get(&format!("{node}_sibling/greeting")).await;
+            let seen = ParamValue::Bool(true);
+            parameters.set(&format!("{node}/seen"), seen).await?;
+            match greeting {
+                Ok(ParamValue::String(greeting)) => greeting,
+                _ => String::new(),
+            }
+        }
+        Err(_) => given("greeting").unwrap_or_default(),
     };
-    bus.set(&format!("{node}/seen"), ParamValue::Bool(true))
-        .await?;
-    let wire_type = WireType::new(
-        "std_msgs/String",
-        "992ce8a1687cec8c8bd883ec73ca41d1",
-        "string data\n",
-    );
+    let registry = Registry::of(version);
+    registry.insert("std_msgs/msg/String", "string data\n")?;
+    let wire_type = WireType::of(&*registry.message("std_msgs/String")?);
+    let (server, mut goals) = match version {
+        RosVersion::One => (None, mpsc::unbounded_channel().1),
+        RosVersion::Two => {
+            let (server, goals) = count(&*bus, &topic("count"))?;
+            (Some(server), goals)
+        }
+    };
     let echo_type = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _echo = bus
         .serve(&format!("{node}/echo"), echo_type, Arc::new(Echo))
@@ -77,15 +167,15 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     if arguments.iter().any(|argument| argument == "patient") {
         out.matched().wait_for(|now| now.connected() > 0).await?;
     }
-    let mut input = bus
-        .subscribe(&topic("in"), wire_type, Qos::keep_last(8))
-        .await?;
+    let keeps = arguments.iter().any(|argument| argument == "keeps");
+    let qos = Qos::keep_last(8).latching(keeps);
+    let mut input = bus.subscribe(&topic("in"), wire_type, qos).await?;
     let mut end = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::interrupt())?;
     loop {
         tokio::select! {
             message = input.messages.recv() => {
                 let Some(message) = message else { return Ok(()) };
-                let text = String::from_utf8_lossy(&message.bytes[4..]).into_owned();
+                let text = read(&*bus, &message.bytes);
                 if crash == Some(text.as_str()) {
                     std::process::exit(3);
                 }
@@ -93,8 +183,13 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
                     Some(service) => asked(&*bus, service).await,
                     None => format!("{greeting}{text}"),
                 };
-                let length = u32::try_from(text.len())?.to_le_bytes();
-                out.publish([&length[..], text.as_bytes()].concat().into());
+                out.publish(written(&*bus, &text)?);
+            }
+            Some((id, result)) = goals.recv() => {
+                if let Some(server) = &server {
+                    let outcome = Outcome::Succeeded;
+                    server.end(&id, GoalEnd { outcome, text: String::new(), result });
+                }
             }
             _ = end.recv() => {
                 bus.close().await;

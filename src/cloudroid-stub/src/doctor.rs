@@ -83,7 +83,7 @@ pub fn examine(asked: &Doctor) -> anyhow::Result<ExitCode> {
     let mut checks = runtime.block_on(server::checks(&config, &stub));
     if asked.only != Some(Part::Server) {
         let variable = |name: &str| std::env::var(name).ok();
-        checks.extend(overlay::checks(&stub, &config, &variable));
+        checks.extend(runtime.block_on(overlay::checks(&stub, &config, &variable)));
     }
     for check in &checks {
         println!("{}", check.lines());

@@ -23,15 +23,21 @@ mod linked;
 mod local;
 mod machine;
 mod mirror;
+mod network;
 mod original;
 mod pairing;
 mod parameters;
+mod params_file;
 mod resolver;
 mod revision;
 mod robot;
+mod ros_args;
 mod run;
+mod seen;
 mod stream;
 mod terms;
+#[cfg(test)]
+mod testing;
 
 use std::process::ExitCode;
 

@@ -138,6 +138,16 @@ impl Mirror {
         self.inputs.renew();
     }
 
+    /// The type of this name and hash, with its definition where that was told.
+    fn wire_type(&self, name: &str, md5: &str) -> WireType {
+        if name == "*" {
+            return WireType::any();
+        }
+        let key = (name.to_owned(), md5.to_owned());
+        let known = self.types.lock().get(&key).cloned();
+        known.unwrap_or_else(|| WireType::new(name, md5, "").written_by(self.bus.version()))
+    }
+
     async fn apply(self: &Arc<Self>, graph: Graph) {
         let mut applied = self.applied.lock().await;
         let session = Arc::downgrade(&self.session());
@@ -237,6 +247,7 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<FromClou
             } => {
                 let key = (name.clone(), md5.clone());
                 let wire_type = WireType::new(name, md5, definition);
+                let wire_type = wire_type.written_by(mirror.bus.version());
                 mirror.types.lock().insert(key, wire_type);
             }
             FromCloud::Graph(graph) => mirror.apply(graph).await,

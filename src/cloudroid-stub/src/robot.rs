@@ -1,72 +1,85 @@
-//! The node as roslaunch started it, and the robot's ROS as its environment tells.
+//! The node as launch files started it, and the robot's ROS as its environment tells.
 
+mod ros1;
+mod ros2;
+
+use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
-use anyhow::{Context, bail};
 use link::control;
-use ros::ros1::names::{self, PeerUri};
+use ros::Network;
+use ros::bus::{ParamValue, RosVersion};
 
+use crate::network::Variable;
 use crate::original;
 use crate::revision::Revision;
-
-/// Where the Master is when nothing is said.
-const MASTER: &str = "http://localhost:11311";
 
 /// What the command line and the environment say.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Robot {
-    /// The Master's host.
-    pub master_host: String,
-    /// The Master's port.
-    pub master_port: u16,
-    /// The host that others reach this node under, where it is said.
-    pub host: Option<String>,
+    /// The robot's ROS.
+    pub ros: RosVersion,
+    /// Where its other nodes are.
+    pub place: Place,
     /// Absolute name of the node.
     pub node: String,
-    /// Arguments, remaps and private parameters for the real node; nothing that begins with `__`.
+    /// Arguments for the node in the cloud: what its name and its namespace follow from is left out, and parameters that stand in
+    /// files of the robot are written out.
     pub argv: Vec<String>,
+    /// Arguments for the local original.
+    pub original_argv: Vec<String>,
+    /// The parameters that the node is given by its command line (ROS 2).
+    pub parameters: BTreeMap<String, ParamValue>,
+    /// Whether the node's time is that of `/clock`, as far as its command line says (ROS 2).
+    pub sim_time: bool,
+}
+
+/// Where the nodes of a robot find each other.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Place {
+    /// At a Master (ROS 1).
+    Master {
+        /// Its host.
+        host: String,
+        /// Its port.
+        port: u16,
+        /// The host that others reach this node under, where it is said.
+        own: Option<String>,
+    },
+    /// In a domain (ROS 2).
+    Domain {
+        /// `ROS_DOMAIN_ID`.
+        id: u16,
+        /// Where nodes of that domain are looked for.
+        network: Network,
+    },
 }
 
 impl Robot {
     /// Reads `argv` (without the program) of the executable, whose default node name is `usual`.
-    pub fn read(
+    ///
+    /// # Errors
+    /// The argument, the file or the variable that cannot be, and why.
+    pub async fn read(
         argv: &[String],
         usual: &str,
-        variable: &dyn Fn(&str) -> Option<String>,
+        ros: RosVersion,
+        variable: Variable<'_>,
     ) -> anyhow::Result<Self> {
-        let set = |name| variable(name).filter(|value| !value.is_empty());
-        let mut namespace = set("ROS_NAMESPACE").unwrap_or_default();
-        let mut name = usual.to_owned();
-        let mut master = set("ROS_MASTER_URI").unwrap_or_else(|| MASTER.to_owned());
-        let mut host = set("ROS_HOSTNAME").or_else(|| set("ROS_IP"));
-        let mut passed = Vec::new();
-        for argument in argv {
-            match argument.split_once(":=") {
-                Some(("__name", value)) => name = value.to_owned(),
-                Some(("__ns", value)) => namespace = value.to_owned(),
-                Some(("__master", value)) => master = value.to_owned(),
-                Some(("__hostname" | "__ip", value)) => host = Some(value.to_owned()),
-                Some((special, _)) if special.starts_with("__") => {}
-                _ => passed.push(argument.clone()),
-            }
+        match ros {
+            RosVersion::One => ros1::read(argv, usual, variable),
+            RosVersion::Two => ros2::read(argv, usual, variable).await,
         }
-        if name.contains('/') {
-            bail!("__name:={name} holds a slash; use __ns:= or ROS_NAMESPACE for the namespace");
-        }
-        let node = names::canonical(&format!("{namespace}/{name}"));
-        if !names::is_global(&node) {
-            bail!("{node:?} is not a name that ROS allows for a node");
-        }
-        let place = PeerUri::parse(&master, "http").with_context(|| {
-            format!("ROS_MASTER_URI is {master:?}; it should look like {MASTER}")
-        })?;
-        Ok(Self {
-            master_host: place.host,
-            master_port: place.port,
-            host,
-            node,
-            argv: passed,
-        })
+    }
+
+    /// What the node's parameters say of the stub itself, by key: `cloudroid.max` by `max`.
+    pub fn settings(&self) -> BTreeMap<String, ParamValue> {
+        let parameters = self.parameters.iter();
+        let settings = parameters.filter_map(|(name, value)| {
+            let key = name.strip_prefix(ros2::SETTINGS)?;
+            Some((key.to_owned(), value.clone()))
+        });
+        settings.collect()
     }
 
     /// What the cloud is to run.
@@ -133,53 +146,6 @@ pub fn usual_name(executable: &str) -> String {
 mod tests {
     use super::*;
 
-    fn read(argv: &[&str], environment: &[(&str, &str)]) -> anyhow::Result<Robot> {
-        let argv: Vec<String> = argv.iter().map(|&argument| argument.to_owned()).collect();
-        Robot::read(&argv, "usual", &|name| {
-            let found = environment.iter().find(|(variable, _)| *variable == name);
-            found.map(|(_, value)| (*value).to_owned())
-        })
-    }
-
-    #[test]
-    fn roslaunch_s_arguments_are_understood() {
-        let robot = read(
-            &[
-                "3",
-                "image:=/camera/image",
-                "_threshold:=2",
-                "__name:=people",
-                "__log:=/x/y.log",
-            ],
-            &[
-                ("ROS_NAMESPACE", "/front/"),
-                ("ROS_MASTER_URI", "http://brain:1234/"),
-            ],
-        )
-        .unwrap();
-        assert_eq!(robot.node, "/front/people");
-        assert_eq!(robot.argv, ["3", "image:=/camera/image", "_threshold:=2"]);
-        assert_eq!(
-            (robot.master_host.as_str(), robot.master_port),
-            ("brain", 1234)
-        );
-        assert_eq!(
-            robot.for_the_cloud("p", "x", Path::new("")).namespace,
-            "/front"
-        );
-    }
-
-    #[test]
-    fn without_any_the_usual_ones_hold() {
-        let robot = read(&[], &[]).unwrap();
-        assert_eq!(
-            (robot.node.as_str(), robot.master_host.as_str()),
-            ("/usual", "localhost")
-        );
-        assert_eq!(robot.for_the_cloud("p", "x", Path::new("")).namespace, "");
-        assert_eq!(usual_name("image-view.py"), "image_view");
-    }
-
     #[test]
     fn places_in_the_overlay_are_written_as_launch_files_write_them() {
         let share = plain(Path::new("/o/lib/p/../../share/./p"));
@@ -200,16 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_said() {
-        for (argv, environment) in [
-            (vec!["__name:=a/b"], vec![]),
-            (vec!["__name:=ä"], vec![]),
-            (vec![], vec![("ROS_MASTER_URI", "localhost:11311")]),
-        ] {
-            assert!(
-                read(&argv, &environment).is_err(),
-                "{argv:?} {environment:?}"
-            );
-        }
+    fn a_node_without_a_name_has_its_executables() {
+        assert_eq!(usual_name("image-view.py"), "image_view");
     }
 }

@@ -33,7 +33,7 @@ use crate::original;
 use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
-use crate::robot::{Robot, usual_name};
+use crate::robot::{Place, Robot, usual_name};
 
 /// For the real node to end after it was told to. roslaunch escalates after 15 s.
 const FAREWELL: Duration = Duration::from_secs(12);
@@ -54,12 +54,19 @@ enum End {
 pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
     let share = &asked.node.share;
     let config = config::read(share, std::env::vars())?;
-    let usual = config.nodes.get(&asked.node.node).cloned();
-    let usual = usual.unwrap_or_else(|| usual_name(&asked.node.node));
-    let robot = Robot::read(&asked.argv, &usual, &|name| std::env::var(name).ok())?;
+    let made_of = Revision::read(share);
+    let executable = &asked.node.node;
+    let named = config
+        .nodes
+        .get(executable)
+        .or(made_of.names.get(executable));
+    let usual = named.cloned().unwrap_or_else(|| usual_name(executable));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
+    let ros = made_of.ros();
+    let variable = |name: &str| std::env::var(name).ok();
+    let robot = runtime.block_on(Robot::read(&asked.argv, &usual, ros, &variable))?;
     let end = runtime.block_on(live(asked, config.clone(), &robot))?;
     drop(runtime);
     match end {
@@ -81,7 +88,7 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         bus = join(robot, &robot.node) => bus?,
         () = stopped(&mut stopping) => return Ok(End::Asked),
     };
-    let config = with_parameters(config, &*bus, &robot.node).await?;
+    let config = with_parameters(config, &*bus, robot).await?;
     let config = config.or(&Revision::read(&asked.node.share).defaults);
     if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
         tracing::warn!(
@@ -103,9 +110,13 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         mirror.promise(sla, original, diagnostics, &bus).await?;
         watcher = Some(bus);
     }
-    let parameters = mirror.parameters().await;
+    let mut parameters = mirror.parameters().await;
+    if robot.sim_time {
+        parameters.insert("use_sim_time".to_owned(), ParamValue::Bool(true));
+    }
     let mut hello = Hello {
         version: env!("CARGO_PKG_VERSION").to_owned(),
+        ros: robot.ros.number(),
         run: format!("{:016x}", rand::random::<u64>()),
         machine: machine::id(),
         host: machine::host(),
@@ -174,17 +185,26 @@ fn node_end(exit: &Result<watch::Ref<'_, Option<Exit>>, watch::error::RecvError>
     }
 }
 
-/// Joins the robot's ROS as a node of this name; waits for its Master as every node does.
+/// Joins the robot's ROS as a node of this name; waits for its Master, or for room in its domain, as every node does.
 async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
     let mut told = false;
     loop {
         let joined = async {
-            let master = RobotSockets
-                .resolve(&robot.master_host, robot.master_port)
-                .await?;
-            let mut options = JoinOptions::new(master, node);
-            options.host = robot.host.clone();
-            anyhow::Ok(ros::connect(RosVersion::One, Arc::new(RobotSockets), options).await?)
+            let options = match &robot.place {
+                Place::Master { host, port, own } => {
+                    let master = RobotSockets.resolve(host, *port).await?;
+                    JoinOptions {
+                        host: own.clone(),
+                        ..JoinOptions::new(master, node)
+                    }
+                }
+                Place::Domain { id, network } => JoinOptions {
+                    network: network.clone(),
+                    distribution: std::env::var("ROS_DISTRO").unwrap_or_default(),
+                    ..JoinOptions::in_domain(*id, node)
+                },
+            };
+            anyhow::Ok(ros::connect(robot.ros, Arc::new(RobotSockets), options).await?)
         };
         match joined.await {
             Ok(bus) => return Ok(bus),
@@ -198,12 +218,22 @@ async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
     }
 }
 
-/// The configuration with what parameters of the node's namespaces say instead.
-async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::Result<Config> {
+/// The configuration with what parameters of the node (ROS 2), or of its namespaces (ROS 1), say instead.
+async fn with_parameters(config: Config, bus: &dyn Bus, robot: &Robot) -> anyhow::Result<Config> {
+    if robot.ros == RosVersion::Two {
+        let settings = robot.settings();
+        return config.with_parameters(&[Group {
+            name: None,
+            settings,
+        }]);
+    }
     let mut given = Vec::new();
-    for name in config::groups(node) {
+    for name in config::groups(&robot.node) {
         match bus.parameter(&name).await {
-            Ok(ParamValue::Map(settings)) => given.push(Group { name, settings }),
+            Ok(ParamValue::Map(settings)) => given.push(Group {
+                name: Some(name),
+                settings,
+            }),
             Ok(_) => bail!(
                 "parameter {name} is a single value, and stands where this node's settings are looked for; remove it with: rosparam delete {name}"
             ),
@@ -220,11 +250,16 @@ async fn with_parameters(config: Config, bus: &dyn Bus, node: &str) -> anyhow::R
 fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
     let overlay = original::overlay(&asked.node.share);
     let path = original::find(&asked.node, &|name| std::env::var(name).ok());
-    let (namespace, name) = robot.node.rsplit_once('/').unwrap_or_default();
+    let (namespace, _) = robot.node.rsplit_once('/').unwrap_or_default();
     let mut environment = original::environment(&overlay);
-    environment.push(("ROS_NAMESPACE", format!("{namespace}/").into()));
-    let mut argv = robot.argv.clone();
-    argv.push(format!("__name:={name}"));
+    let domain = match &robot.place {
+        Place::Domain { id, .. } => Some(*id),
+        Place::Master { .. } => {
+            environment.push(("ROS_NAMESPACE", format!("{namespace}/").into()));
+            None
+        }
+    };
+    let argv = robot.original_argv.clone();
     Setting {
         program: path.map(|path| Program {
             path,
@@ -232,6 +267,7 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
             environment,
         }),
         node: robot.node.clone(),
+        domain,
     }
 }
 

@@ -2,13 +2,15 @@
 //!
 //! ```text
 //!  image ──contents──▶ Contents ─┐
-//!  service, interface ─▶ About ──┴─compose─▶ files of a catkin install space ──(caller)──▶ NAME.tar.gz
+//!  service, interface ─▶ About ──┴─compose─▶ files of an install space (catkin's, ament's) ──(caller)──▶ NAME.tar.gz
 //! ```
 //!
-//! Workspaces are searched only up to the first that holds a package. So the stub has a launcher for every
+//! Install spaces are searched only up to the first that holds a package. So the stub has a launcher for every
 //! executable, not only for those that run in the cloud, and everything that the package shares. The same input
 //! gives the same files. The robot's program, `lib/PACKAGE/cloudroid-stub`, is added by the caller, who has it.
 
+mod ament;
+mod catkin;
 mod contents;
 mod manifest;
 mod needed;
@@ -19,6 +21,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 pub use contents::{Content, Contents};
 pub use manifest::{MANIFEST, SIGNATURE, SIGNER, manifest};
+use ros::bus::RosVersion;
 
 use crate::Error;
 use crate::interface::Interface;
@@ -28,9 +31,6 @@ pub const PROGRAM: &str = "cloudroid-stub";
 
 const RUN: &str = include_str!("stub/inside/run.sh");
 const ORIGINAL: &str = include_str!("stub/inside/original.sh");
-const SETUP_SH: &str = include_str!("stub/inside/setup.sh");
-const SETUP_BASH: &str = include_str!("stub/inside/setup.bash");
-const SETUP_ZSH: &str = include_str!("stub/inside/setup.zsh");
 const INSTALL: &str = include_str!("stub/inside/install.sh");
 const README: &str = include_str!("stub/inside/README.md");
 
@@ -46,6 +46,8 @@ pub struct Portal {
 /// What a stub stands for.
 #[derive(Debug, Clone)]
 pub struct About<'a> {
+    /// The service's ROS, which the robot's has to be.
+    pub ros: RosVersion,
     /// The service.
     pub service: &'a str,
     /// The ROS package.
@@ -60,6 +62,8 @@ pub struct About<'a> {
     pub architecture: &'a str,
     /// Executables that run in the cloud.
     pub outsourced: &'a BTreeSet<String>,
+    /// Names that programs give their nodes where nobody else does, by executable, as far as they are known.
+    pub names: &'a BTreeMap<String, String>,
     /// What the package shows.
     pub interface: &'a Interface,
     /// Answers depend on earlier requests, as the deployer says.
@@ -83,22 +87,20 @@ const OURS: [&str; 6] = [
 pub type Files = BTreeMap<String, Content>;
 
 /// Puts a stub together.
-pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
+pub fn compose(about: &About<'_>, mut contents: Contents) -> Result<Files, Error> {
     let package = about.package;
     if !contents.share.contains_key("package.xml") {
         return Err(Error::NoManifest {
             package: package.to_owned(),
         });
     }
-    let mut files = Files::new();
-    for (name, text) in [
-        (".catkin", ""),
-        ("setup.sh", SETUP_SH),
-        ("setup.bash", SETUP_BASH),
-        ("setup.zsh", SETUP_ZSH),
-    ] {
-        files.insert(name.to_owned(), plain(text));
-    }
+    let mut files = match about.ros {
+        RosVersion::One => {
+            catkin::replaced(about, &mut contents);
+            catkin::files()
+        }
+        RosVersion::Two => ament::files(about, &contents),
+    };
     let names = executables(about, &contents);
     files.insert("install.sh".to_owned(), plain(&filled(INSTALL, about)));
     files.insert("README.md".to_owned(), plain(&manual(about, &names)));
@@ -106,19 +108,14 @@ pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
         let launcher = launcher(about, name, "/../..");
         files.insert(format!("lib/{package}/{name}"), launcher);
     }
-    let refused = nodelets::plugin_lists(&contents.share);
     for (path, content) in contents.share {
         // Below such a name, too: then it is a directory.
         if OURS.contains(&path.split('/').next().unwrap_or_default())
-            || !goes_along(&path, &content)
+            || !goes_along(about, &path, &content)
         {
             continue;
         }
-        let content = if refused.contains(&path) {
-            nodelets::refusing(about, content)
-        } else {
-            shared(about, &path, content)
-        };
+        let content = shared(about, &path, content);
         files.insert(format!("share/{package}/{path}"), content);
     }
     for (key, text) in &about.interface.definitions {
@@ -137,7 +134,10 @@ pub fn compose(about: &About<'_>, contents: Contents) -> Result<Files, Error> {
     Ok(files)
 }
 
-fn goes_along(path: &str, content: &Content) -> bool {
+fn goes_along(about: &About<'_>, path: &str, content: &Content) -> bool {
+    if about.ros == RosVersion::Two && ament::is_of_the_install_space(path, content) {
+        return false;
+    }
     match content {
         Content::File { executable, .. } => needed::is_needed(path, *executable),
         Content::Link(target) => {
@@ -146,25 +146,35 @@ fn goes_along(path: &str, content: &Content) -> bool {
     }
 }
 
-/// Every name that has a launcher in `lib/PACKAGE`: those of the image, and those outsourced.
+/// Every name that has a launcher in `lib/PACKAGE`.
 fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
-    let in_share = |name: &String| {
-        contents
-            .share
-            .keys()
-            .any(|path| path.rsplit('/').next() == Some(name.as_str()))
+    let mut names = match about.ros {
+        RosVersion::One => catkin::executables(about, contents),
+        RosVersion::Two => ament::executables(about, contents),
     };
-    let mut names = contents.executables.clone();
-    // One that is a shared script has its launcher in the script's place.
-    names.extend(
-        about
-            .outsourced
-            .iter()
-            .filter(|name| !in_share(name))
-            .cloned(),
-    );
     names.retain(|name| name != PROGRAM && !name.chars().any(char::is_control));
     names
+}
+
+/// What texts call things that have other names in the other ROS.
+struct Words {
+    /// The command that starts a node.
+    run: &'static str,
+    /// Why the overlay's set-up file is sourced last.
+    order: &'static str,
+    /// What cannot be loaded on the robot.
+    plugins: &'static str,
+    /// Where a robot may give a setting beside `stub.toml`.
+    settings: &'static str,
+}
+
+impl Words {
+    fn of(ros: RosVersion) -> &'static Words {
+        match ros {
+            RosVersion::One => &catkin::WORDS,
+            RosVersion::Two => &ament::WORDS,
+        }
+    }
 }
 
 /// A shared file as the stub has it: programs give way to launchers.
@@ -216,7 +226,12 @@ fn plain(text: &str) -> Content {
 }
 
 fn filled(template: &str, about: &About<'_>) -> String {
+    let words = Words::of(about.ros);
     template
+        .replace("@ROS@", &about.ros.number().to_string())
+        .replace("@RUN@", words.run)
+        .replace("@ORDER@", words.order)
+        .replace("@PLUGINS@", words.plugins)
         .replace("@PACKAGE@", about.package)
         .replace("@SERVICE@", about.service)
         .replace("@REVISION@", &about.revision.to_string())

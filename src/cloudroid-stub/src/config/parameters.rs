@@ -1,5 +1,5 @@
-//! What ROS parameters say instead of `stub.toml`: `cloudroid/KEY` in the node's own namespace, or in one around it,
-//! where it holds for all nodes of that namespace. The nearest wins.
+//! What ROS parameters say instead of `stub.toml`. In ROS 1: `cloudroid/KEY` in the node's own namespace, or in one around it,
+//! where it holds for all nodes of that namespace; the nearest wins. In ROS 2: the node's own `cloudroid.KEY`.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -13,12 +13,29 @@ use super::sources::with;
 /// A group's name: what comes after the namespace.
 const GROUP: &str = "cloudroid";
 
-/// The settings of one namespace.
+/// The settings of one namespace (ROS 1), or of the node (ROS 2).
 pub struct Group {
-    /// The parameter that holds them, such as `/front/cloudroid`.
-    pub name: String,
+    /// The parameter that holds them, such as `/front/cloudroid`; none for the node's own of ROS 2.
+    pub name: Option<String>,
     /// By key.
     pub settings: BTreeMap<String, ParamValue>,
+}
+
+impl Group {
+    /// The parameter that gives a key, and how that is taken back.
+    fn giver(&self, key: &str) -> (String, String) {
+        match &self.name {
+            Some(name) => {
+                let giver = format!("{name}/{key}");
+                let removal = format!("remove it with: rosparam delete {giver}");
+                (giver, removal)
+            }
+            None => {
+                let removal = "remove it from the command line (-p), or from the parameters file";
+                (format!("{GROUP}.{key}"), removal.to_owned())
+            }
+        }
+    }
 }
 
 /// The parameters that may hold settings for a node, the nearest last: `/cloudroid`, `/front/cloudroid`,
@@ -40,15 +57,14 @@ impl Config {
     pub fn with_parameters(&self, given: &[Group]) -> anyhow::Result<Config> {
         let mut table = Table::try_from(self)?;
         // Who has given a key.
-        let mut givers: HashMap<&str, String> = HashMap::new();
+        let mut givers: HashMap<&str, (String, String)> = HashMap::new();
         for group in given {
             for (key, value) in &group.settings {
-                let giver = format!("{}/{key}", group.name);
+                let (giver, removal) = group.giver(key);
                 let refused = |reason: &str| {
                     let value = shown(value);
-                    let set = "set it otherwise, or remove it with";
                     anyhow::anyhow!(
-                        "parameter {giver} is {value}: {reason}; {set}: rosparam delete {giver}"
+                        "parameter {giver} is {value}: {reason}; set it otherwise, or {removal}"
                     )
                 };
                 let given = Value::try_from(value).map_err(|error| refused(&error.to_string()))?;
@@ -56,7 +72,7 @@ impl Config {
                 if let Err(error) = table.clone().try_into::<Config>() {
                     return Err(refused(error.message().trim()));
                 }
-                givers.insert(key, giver);
+                givers.insert(key, (giver, removal));
             }
         }
         let config: Config = table.clone().try_into()?;
@@ -71,7 +87,9 @@ impl Config {
             };
             let giver = givers.get(wrong.key).or_else(|| givers.get(other));
             match giver {
-                Some(giver) => bail!("parameter {giver}: {wrong} (rosparam delete {giver})"),
+                Some((giver, removal)) => {
+                    bail!("parameter {giver}: {wrong}; set it otherwise, or {removal}")
+                }
                 None => return Err(wrong.into()),
             }
         }
@@ -97,7 +115,7 @@ mod tests {
     fn group(name: &str, settings: &[(&str, ParamValue)]) -> Group {
         let settings = settings.iter();
         Group {
-            name: name.to_owned(),
+            name: Some(name.to_owned()),
             settings: settings
                 .map(|(key, value)| ((*key).to_owned(), value.clone()))
                 .collect(),

@@ -1,26 +1,30 @@
 //! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
 //! the application.
 
+mod goal_messages;
+mod goals;
+mod managing;
+
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use bytes::Bytes;
+use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use qos::{
     Channel, Effect, Event, Failure, Governor, HandOver, Ledger, Limits, LocalState, Mode, Outcome,
     Pair, Phases, RequestId, SafeStop, Side, Sla, Verdict, Why,
 };
-use ros::bus::{BusError, Message, PeerId};
+use ros::bus::{Message, PeerId, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
 use super::original::{Interface, News, Original};
+use super::remembered::Remembered;
 use super::stamp::{Stamps, age};
-
-/// Longer than any call of a local service is waited for.
-const LOCAL_CALL: Duration = Duration::from_secs(24 * 3600);
+use goals::Goals;
 
 /// The way to the servant.
 pub trait Cloud: Send + Sync + 'static {
@@ -28,7 +32,12 @@ pub trait Cloud: Send + Sync + 'static {
     fn publish(&self, topic: &str, message: &Message);
     /// Sends a call; its answer comes by [`Keeper::cloud_answered`] under the same id.
     fn call(&self, request: RequestId, service: &str, bytes: Bytes);
+    /// Sends a call that is not measured, and gives its answer. While the link is away that waits.
+    fn ask(&self, service: &str, bytes: Bytes) -> Answer;
 }
+
+/// What a call of one side will come to.
+pub type Answer = BoxFuture<'static, Result<Bytes, Failure>>;
 
 /// The robot's nodes.
 pub trait Application: Send + Sync + 'static {
@@ -53,6 +62,8 @@ pub enum Payload {
     Input(Message),
     /// A serialized service request.
     Call(Bytes),
+    /// A goal of an action that is made of calls (ROS 2).
+    Goal(Arc<goals::Sent>),
 }
 
 /// One node's keeper. Its tasks end with it, and so does the local original.
@@ -61,6 +72,10 @@ pub struct Keeper {
     cloud: Arc<dyn Cloud>,
     robot: Arc<dyn Application>,
     original: Option<Arc<Original>>,
+    /// What the node was told to be.
+    remembered: Arc<Remembered>,
+    /// Of that the cloud was not told something.
+    cloud_missed: AtomicBool,
     safe_stop: Option<SafeStop>,
     ending: AtomicBool,
     /// The next deadline may have changed.
@@ -76,6 +91,7 @@ struct State {
     /// What was lost at the last hand-over.
     lost: Option<(Instant, String)>,
     callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
+    goals: Goals,
 }
 
 impl Keeper {
@@ -98,11 +114,15 @@ impl Keeper {
             governor: Governor::new(sla, pairs, Limits::default()),
             stamps: Stamps::default(),
             callers: HashMap::new(),
+            goals: Goals::default(),
         };
+        let remembered = original.as_ref().map(|original| original.remembered());
         let keeper = Arc::new_cyclic(|this| Self {
             state: Mutex::new(state),
             cloud,
             robot,
+            remembered: remembered.unwrap_or_default(),
+            cloud_missed: AtomicBool::new(false),
             original: original.map(Arc::new),
             safe_stop,
             ending: AtomicBool::new(false),
@@ -125,6 +145,14 @@ impl Keeper {
         match &self.original {
             Some(original) => original.adapt(interface).await,
             None => Ok(()),
+        }
+    }
+
+    /// These types have become known, which messages of ROS 2 have without their definitions.
+    pub fn learn_types<'a>(&self, types: impl Iterator<Item = &'a WireType>) {
+        let mut state = self.state.lock();
+        for wire_type in types {
+            state.stamps.learn(wire_type);
         }
     }
 
@@ -238,6 +266,7 @@ impl Keeper {
             }
             state.governor.link_up(now, resumed);
         });
+        self.tell_cloud(resumed);
     }
 
     /// The link is down.
@@ -266,6 +295,11 @@ impl Keeper {
 
     fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
         let verdict = self.with(|state, now| {
+            match state.feedback(side, topic, message) {
+                Some(true) => return Verdict::Deliver,
+                Some(false) => return Verdict::Drop,
+                None => {}
+            }
             let stamp = state.stamps.of(message).filter(|stamp| !stamp.is_zero());
             let age = stamp.map(age).unwrap_or_default();
             let key = state.stamps.key(message);
@@ -325,6 +359,7 @@ impl Keeper {
                 } = effect
                 {
                     state.reply(*request, Err(reason.clone()));
+                    state.goals.fail(*request);
                 }
             }
             let over = state.hands_over(now, &effects);
@@ -355,6 +390,7 @@ impl Keeper {
                 (Side::Cloud, Channel::Call(service), Payload::Call(bytes), Some(id)) => {
                     self.cloud.call(id, &service, bytes);
                 }
+                (side, _, Payload::Goal(sent), Some(id)) => self.give_goal(side, id, &sent),
                 (Side::Local, channel, payload, request) => {
                     self.give_local(&channel, payload, request)
                 }
@@ -382,6 +418,18 @@ impl Keeper {
         }
     }
 
+    /// Calls a side, which is not measured.
+    fn ask(&self, side: Side, service: &str, bytes: Bytes) -> Answer {
+        match (side, &self.original) {
+            (Side::Cloud, _) => self.cloud.ask(service, bytes),
+            (Side::Local, Some(original)) => original.call(service, bytes),
+            (Side::Local, None) => {
+                let reason = "there is no local original".to_owned();
+                Box::pin(async move { Err(Failure::Unreachable(reason)) })
+            }
+        }
+    }
+
     fn give_local(&self, channel: &Channel, payload: Payload, request: Option<RequestId>) {
         let Some(original) = &self.original else {
             return;
@@ -389,15 +437,10 @@ impl Keeper {
         match (channel, payload, request) {
             (Channel::Topic(topic), Payload::Input(message), _) => original.feed(topic, &message),
             (Channel::Call(service), Payload::Call(bytes), Some(id)) => {
-                let (original, service) = (original.clone(), service.clone());
+                let answer = original.call(service, bytes);
                 let keeper = self.this.clone();
                 tokio::spawn(async move {
-                    let result = original.call(&service, bytes, LOCAL_CALL).await;
-                    drop(original);
-                    let result = result.map_err(|error| match error {
-                        BusError::CallFailed { reason, .. } => Failure::Refused(reason),
-                        other => Failure::Unreachable(other.to_string()),
-                    });
+                    let result = answer.await;
                     if let Some(keeper) = keeper.upgrade() {
                         keeper.answered(Side::Local, id, result, None);
                     }

@@ -5,12 +5,12 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Digest, Message, PeerId, Publisher, Qos, WireType};
+use ros::bus::{Digest, Message, PeerId, Publisher, Qos, RosVersion, WireType};
 use ros::ring::{Bounds, Ring};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use super::private_master::PrivateMaster;
+use super::private_system::PrivateSystem;
 
 /// Messages of one publisher kept for a process that is slow, and while its advertisement is made; a newcomer is given the
 /// last one of each publisher.
@@ -76,9 +76,9 @@ impl Drop for Latched {
 }
 
 impl Latched {
-    pub fn begin(master: &Arc<PrivateMaster>) -> Self {
+    pub fn begin(system: &Arc<PrivateSystem>) -> Self {
         let due = Arc::new(Due::default());
-        let task = tokio::spawn(serve(master.clone(), due.clone())).abort_handle();
+        let task = tokio::spawn(serve(system.clone(), due.clone())).abort_handle();
         Self { due, task }
     }
 
@@ -87,7 +87,7 @@ impl Latched {
         self.due.add(topic, &message.publisher, |news| {
             let lost = news.messages.push(message.clone());
             if lost.messages > 0 {
-                tracing::debug!(%topic, dropped = lost.messages, "newer latched messages took the master of older ones");
+                tracing::debug!(%topic, dropped = lost.messages, "newer latched messages took the place of older ones");
             }
         });
     }
@@ -105,7 +105,7 @@ impl Latched {
 type Repeated = HashMap<Key, (Digest, Box<dyn Publisher>)>;
 
 /// Serves one publisher after the other; only its first message takes time, for the advertisement.
-async fn serve(master: Arc<PrivateMaster>, due: Arc<Due>) {
+async fn serve(system: Arc<PrivateSystem>, due: Arc<Due>) {
     let mut all = Repeated::new();
     loop {
         let (key, news) = due.next().await;
@@ -119,8 +119,13 @@ async fn serve(master: Arc<PrivateMaster>, due: Arc<Due>) {
                 continue;
             }
             let of = WireType::clone(&message.wire_type);
-            let qos = Qos::keep_last(QUEUE).latching(true);
-            match master.bus().advertise(&key.0, of, qos).await {
+            let depth = match system.bus().version() {
+                RosVersion::One => QUEUE,
+                // Here a publisher gives newcomers all that it keeps.
+                RosVersion::Two => 1,
+            };
+            let qos = Qos::keep_last(depth).latching(true);
+            match system.bus().advertise(&key.0, of, qos).await {
                 Ok(publisher) => {
                     publisher.publish(message.bytes);
                     all.insert(key.clone(), (digest.clone(), publisher));

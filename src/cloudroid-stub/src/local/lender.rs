@@ -9,6 +9,9 @@ use bytes::Bytes;
 use ros::bus::{Bus, BusError, Digest, Lender, Lent, ServiceHandler};
 use tokio::sync::watch;
 
+/// Longer than any goal is waited for.
+const GOAL: Duration = Duration::from_secs(24 * 3600);
+
 /// Lends what is served on the robot, but by the node that is stood in for.
 pub struct Robot {
     bus: Arc<dyn Bus>,
@@ -63,12 +66,21 @@ struct Passing {
 impl ServiceHandler for Passing {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let (service, digest) = (&self.service, &self.digest);
-        let called = self.bus.call_typed(service, digest, request, self.limit);
+        let limit = limit(service, self.limit);
+        let called = self.bus.call_typed(service, digest, request, limit);
         called.await.map_err(|error| match error {
             BusError::CallFailed { reason, .. } => reason,
             error @ BusError::Timeout { .. } => took_too_long(&error),
             other => other.to_string(),
         })
+    }
+}
+
+/// How long a service of the robot may take that has this limit. The result of a goal (ROS 2) takes as long as the goal.
+pub fn limit(service: &str, limit: Duration) -> Duration {
+    match service.ends_with("/_action/get_result") {
+        true => limit.max(GOAL),
+        false => limit,
     }
 }
 

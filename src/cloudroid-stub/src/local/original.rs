@@ -14,22 +14,29 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use qos::LocalState;
-use ros::bus::{Bus, BusError, Matched, Message, PeerId, Publisher, Qos, WireType, reaches};
+use qos::{Failure, LocalState};
+use ros::bus::{
+    Bus, BusError, Matched, Message, PeerId, Publisher, Qos, Reliability, WireType, reaches,
+};
 use tokio::process::Child;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
+use super::keeper::Answer;
 use super::latched::Latched;
-use super::private_master::{PrivateMaster, Registered};
+use super::private_system::{Changes, PrivateSystem, Registered};
 use super::process::{self, Program};
+use super::remembered::Remembered;
+use crate::seen;
 
 /// Messages kept per topic: what waits longer is old.
-const QUEUE: usize = 16;
+pub const QUEUE: usize = 16;
 /// How long the original may take to register all of the interface once its node is registered; another version of it may
 /// lack a part.
 const SETTLE: Duration = Duration::from_secs(3);
+/// Longer than any call of a local service is waited for.
+const CALL: Duration = Duration::from_secs(24 * 3600);
 /// Pauses after crashes, at first and at last; and how long a life forgives them.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
 const FORGIVEN: Duration = Duration::from_secs(30);
@@ -41,6 +48,8 @@ pub struct Setting {
     pub program: Option<Program>,
     /// Its absolute node name.
     pub node: String,
+    /// The domain of the robot's nodes (ROS 2), which is not the original's.
+    pub domain: Option<u16>,
 }
 
 /// What is known of the node's interface. It is ready when it listens to what it is waited for, and has registered the
@@ -49,7 +58,9 @@ pub struct Setting {
 pub struct Interface {
     /// What it listens to.
     pub inputs: BTreeMap<String, WireType>,
-    /// Of these, those that it must listen to before it is given anything.
+    /// What it asks for of inputs, where that is told (ROS 2).
+    pub asked: BTreeMap<String, Qos>,
+    /// Of the inputs, those that it must listen to before it is given anything.
     pub awaited: BTreeSet<String>,
     /// What it publishes.
     pub outputs: Vec<String>,
@@ -73,11 +84,12 @@ pub struct Original {
     /// The node's name.
     node: String,
     orders: mpsc::UnboundedSender<Order>,
-    master: Arc<PrivateMaster>,
+    system: Arc<PrivateSystem>,
     publishers: Publishers,
     sources: Sources,
     latched: Latched,
     expected: Expected,
+    remembered: Arc<Remembered>,
     news: mpsc::UnboundedSender<News>,
     tasks: Mutex<Tasks>,
 }
@@ -114,33 +126,37 @@ impl Original {
         robot: Arc<dyn Bus>,
         limit: Duration,
     ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
-        let master = Arc::new(PrivateMaster::new().await?);
-        master.lend(&setting.node, &robot, limit).await?;
+        let system = PrivateSystem::new(&*robot, setting.domain).await?;
+        let system = Arc::new(system);
+        system.lend(&setting.node, &robot, limit).await?;
         let (news, received) = mpsc::unbounded_channel();
         let publishers = Arc::default();
         let sources = Arc::default();
         let expected = Expected::default();
-        let latched = Latched::begin(&master);
+        let remembered = Arc::default();
+        let latched = Latched::begin(&system);
         let (orders, taken) = mpsc::unbounded_channel();
         let node = setting.node.clone();
         let runner = Runner {
             setting,
-            master: master.clone(),
+            system: system.clone(),
             robot,
             publishers: Arc::clone(&publishers),
             sources: Arc::clone(&sources),
             expected: Arc::clone(&expected),
+            remembered: Arc::clone(&remembered),
             news: news.clone(),
         };
         let task = tokio::spawn(runner.run(taken)).abort_handle();
         let original = Self {
             node,
             orders,
-            master,
+            system,
             publishers,
             sources,
             latched,
             expected,
+            remembered,
             news,
             tasks: Mutex::new(Tasks(vec![task])),
         };
@@ -156,7 +172,7 @@ impl Original {
                 continue;
             }
             let subscription = self
-                .master
+                .system
                 .bus()
                 .subscribe(
                     &output,
@@ -180,22 +196,29 @@ impl Original {
             self.tasks.lock().0.push(task.abort_handle());
         }
         for (topic, wire_type) in interface.inputs {
-            if !self.publishers.lock().contains_key(&topic) {
-                let publisher = advertise(&self.master, &topic, &wire_type).await?;
+            let asked = interface.asked.get(&topic);
+            if hears_plain(asked) && !self.publishers.lock().contains_key(&topic) {
+                let qos = offered(asked);
+                let publisher = advertise(&self.system, &topic, &wire_type, qos).await?;
                 self.publishers.lock().insert(topic, publisher);
             }
         }
         Ok(())
     }
 
+    /// What it is told at each start.
+    pub fn remembered(&self) -> Arc<Remembered> {
+        Arc::clone(&self.remembered)
+    }
+
     /// What it has registered, with types.
     pub async fn registered(&self) -> Registered {
-        self.master.registered_by(&self.node).await
+        self.system.registered_by(&self.node).await
     }
 
     /// Changes with whatever is registered.
-    pub fn registrations(&self) -> watch::Receiver<u64> {
-        self.master.changes()
+    pub fn registrations(&self) -> Changes {
+        self.system.changes()
     }
 
     /// Returns once the process is connected to all inputs, or has had time to be.
@@ -239,10 +262,15 @@ impl Original {
             publisher.publish(message.bytes.clone());
             return;
         }
-        let (master, publishers) = (self.master.clone(), self.publishers.clone());
+        let asked = self.expected.lock().asked.get(topic).copied();
+        if !hears_plain(asked.as_ref()) {
+            return;
+        }
+        let (system, publishers) = (self.system.clone(), self.publishers.clone());
+        let qos = offered(asked.as_ref());
         let (topic, message) = (topic.to_owned(), message.clone());
         tokio::spawn(async move {
-            match advertise(&master, &topic, &message.wire_type).await {
+            match advertise(&system, &topic, &message.wire_type, qos).await {
                 Ok(publisher) => {
                     publisher.publish(message.bytes);
                     publishers.lock().entry(topic).or_insert(publisher);
@@ -252,35 +280,56 @@ impl Original {
         });
     }
 
-    /// Calls one of its services.
-    pub async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
-        self.master.bus().call(service, request, timeout).await
+    /// Calls one of its services, however long it takes.
+    pub fn call(&self, service: &str, request: Bytes) -> Answer {
+        call(self.system.bus().clone(), service, request)
     }
 }
 
+fn call(bus: Arc<dyn Bus>, service: &str, request: Bytes) -> Answer {
+    let service = service.to_owned();
+    Box::pin(async move {
+        let answer = bus.call(&service, request, CALL).await;
+        answer.map_err(|error| match error {
+            BusError::CallFailed { reason, .. } => Failure::Refused(reason),
+            other => Failure::Unreachable(other.to_string()),
+        })
+    })
+}
+
 async fn advertise(
-    master: &PrivateMaster,
+    system: &PrivateSystem,
     topic: &str,
     wire_type: &WireType,
+    qos: Qos,
 ) -> Result<Box<dyn Publisher>, BusError> {
-    master
-        .bus()
-        .advertise(topic, wire_type.clone(), Qos::keep_last(QUEUE))
-        .await
+    system.bus().advertise(topic, wire_type.clone(), qos).await
+}
+
+/// Whether a node that asks for this hears what is not latched. One that asks for what is hears nothing else (ROS 2).
+fn hears_plain(asked: Option<&Qos>) -> bool {
+    asked.is_none_or(|asked| !asked.is_latching())
+}
+
+/// What an input is advertised with, so that it is heard by a node that asks for this. All hear a reliable one; of what is said of
+/// time, an end of ROS 2 asks for as much as it names.
+fn offered(asked: Option<&Qos>) -> Qos {
+    let plain = Qos::keep_last(QUEUE);
+    asked.map_or(plain, |asked| Qos {
+        reliability: Reliability::Reliable,
+        depth: QUEUE,
+        ..*asked
+    })
 }
 
 struct Runner {
     setting: Setting,
-    master: Arc<PrivateMaster>,
+    system: Arc<PrivateSystem>,
     robot: Arc<dyn Bus>,
     publishers: Publishers,
     sources: Sources,
     expected: Expected,
+    remembered: Arc<Remembered>,
     news: mpsc::UnboundedSender<News>,
 }
 
@@ -309,13 +358,13 @@ impl Runner {
                     reason = self.watch(&mut child) => reason,
                     () = stopped(orders) => {
                         process::end(&mut child).await;
-                        self.master.process_exited().await;
+                        self.system.process_exited(&self.setting.node).await;
                         return;
                     }
                 },
                 Err(error) => format!("{error:#}"),
             };
-            self.master.process_exited().await;
+            self.system.process_exited(&self.setting.node).await;
             let _ = self.news.send(News::Crashed(reason));
             if born.elapsed() > FORGIVEN {
                 pause = BACKOFF.0;
@@ -330,8 +379,8 @@ impl Runner {
 
     async fn spawn(&self, program: &Program) -> anyhow::Result<Child> {
         // They may have changed since the last start.
-        self.master.copy_parameters(&*self.robot).await?;
-        program.spawn(self.master.uri())
+        self.system.copy_parameters(&*self.robot).await?;
+        program.spawn(&self.system.environment())
     }
 
     /// Tells when it is ready; gives the reason when it ends.
@@ -346,14 +395,11 @@ impl Runner {
     /// Its node is registered, listens to its inputs, and what it publishes is heard.
     async fn ready(&self) {
         let node = &self.setting.node;
-        self.master.registered(node).await;
+        self.system.registered(node).await;
         let expected = self.expected.lock().clone();
-        let _ = timeout(SETTLE, self.master.registers(node, &expected)).await;
-        let published = self.master.graph();
-        let listens = |topic: &String| {
-            let nodes = published.topics.get(topic).map(|topic| &topic.subscribers);
-            nodes.is_some_and(|nodes| nodes.contains(node))
-        };
+        let _ = timeout(SETTLE, self.system.registers(node, &expected)).await;
+        let graph = self.system.graph();
+        let listens = |topic: &String| seen::subscribes(&graph, node, topic);
         let ends: Vec<_> = {
             let inputs = self.publishers.lock();
             let due = inputs
@@ -366,11 +412,13 @@ impl Runner {
         }
         let sources = self.sources.lock().clone();
         for (topic, source) in sources {
-            let nodes = published.topics.get(&topic).map(|topic| &topic.publishers);
-            if nodes.is_some_and(|nodes| nodes.contains(&self.setting.node)) {
+            if seen::publishes(&graph, node, &topic) {
                 reaches(source, 1).await;
             }
         }
+        let bus = self.system.bus();
+        let ask = |service: &str, request| call(bus.clone(), service, request);
+        self.remembered.tell(ask).await;
     }
 
     fn report(&self, state: LocalState) {

@@ -10,6 +10,8 @@ use nix::unistd::Pid;
 use tokio::process::{Child, Command};
 use tokio::time::timeout;
 
+use super::private_system::Variables;
+
 /// roslaunch's order and patience, shorter: the robot's application is not concerned any more.
 const ESCALATION: [(Signal, Duration); 2] = [
     (Signal::SIGINT, Duration::from_secs(5)),
@@ -28,20 +30,23 @@ pub struct Program {
 }
 
 impl Program {
-    /// Starts it. It is killed when what is returned is dropped, and by the kernel when the calling thread ends
+    /// Starts it in the system that these variables tell of. It is killed when what is returned is dropped, and by the kernel when the calling thread ends
     /// without that: a stub that is killed leaves nobody behind who computes for no one. So the caller is a thread that
     /// lasts as long as the stub does.
     #[allow(unsafe_code)]
-    pub fn spawn(&self, master: &str) -> anyhow::Result<Child> {
+    pub fn spawn(&self, place: &Variables) -> anyhow::Result<Child> {
         let mut command = Command::new(&self.path);
         command
             .args(&self.argv)
             .envs(self.environment.iter().map(|(name, value)| (name, value)))
-            .env("ROS_MASTER_URI", master)
-            .env("ROS_HOSTNAME", "localhost")
-            .env_remove("ROS_IP")
             .stdin(std::process::Stdio::null())
             .kill_on_drop(true);
+        for (name, value) in place {
+            match value {
+                Some(value) => command.env(name, value),
+                None => command.env_remove(name),
+            };
+        }
         let stub = nix::unistd::getpid();
         // SAFETY: between fork and exec two system calls are made, both of which a signal handler may make, and nothing
         // is allocated.

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::time::Duration;
 
 use qos::{Key, Stamp};
-use ros::bus::{Digest, Message, WireType};
+use ros::bus::{Digest, Message, RosVersion, WireFormat, WireType};
 use ros::codec;
 use ros::ros1::actions;
 use ros::schema::Registry;
@@ -12,26 +12,40 @@ use ros::schema::Registry;
 /// Knows for each type whether it begins with a header.
 #[derive(Debug)]
 pub struct Stamps {
-    header: codec::Stamps,
+    /// Where headers of each ROS have their stamp: 1, 2.
+    headers: [codec::Stamps; 2],
     stamped: HashMap<Digest, bool>,
 }
 
 impl Default for Stamps {
     fn default() -> Self {
-        let header = Registry::new().message("std_msgs/Header");
-        Self {
-            header: header
+        let header = |version| {
+            let header = Registry::of(version).message("std_msgs/Header");
+            header
                 .map(|header| codec::Stamps::of(&header))
-                .unwrap_or_default(),
+                .unwrap_or_default()
+        };
+        Self {
+            headers: [RosVersion::One, RosVersion::Two].map(header),
             stamped: HashMap::new(),
         }
     }
 }
 
 impl Stamps {
-    /// The id of an action's goal, in goals, results and feedback; else the stamp.
+    /// A type has become known, which messages of ROS 2 have without its definition.
+    pub fn learn(&mut self, wire_type: &WireType) {
+        if !wire_type.definition.is_empty() {
+            let stamped = is_stamped(wire_type);
+            self.stamped.insert(wire_type.digest.clone(), stamped);
+        }
+    }
+
+    /// The id of an action's goal, in goals, results and feedback of ROS 1; else the stamp.
     pub fn key(&mut self, message: &Message) -> Option<Key> {
-        if actions::carries_goal_id(&message.wire_type.name) {
+        if message.wire_type.format == WireFormat::Ros1
+            && actions::carries_goal_id(&message.wire_type.name)
+        {
             let id = actions::messages::goal_id(&message.bytes)?;
             return Some(Key::Goal(id.into()));
         }
@@ -44,15 +58,16 @@ impl Stamps {
         let stamped = match self.stamped.get(&wire_type.digest) {
             Some(stamped) => *stamped,
             None => {
-                let stamped = is_stamped(wire_type);
+                self.learn(wire_type);
                 // A type whose definition has not come may be known later.
-                if !wire_type.definition.is_empty() {
-                    self.stamped.insert(wire_type.digest.clone(), stamped);
-                }
-                stamped
+                is_stamped(wire_type)
             }
         };
-        let found = self.header.first(&message.bytes).filter(|_| stamped)?;
+        let header = match wire_type.format {
+            WireFormat::Ros1 => &self.headers[0],
+            WireFormat::Cdr => &self.headers[1],
+        };
+        let found = header.first(&message.bytes).filter(|_| stamped)?;
         Some(Stamp {
             secs: found.secs,
             nsecs: found.nsecs,
@@ -72,9 +87,13 @@ pub fn is_stamped(wire_type: &WireType) -> bool {
         .map(|line| line.split('#').next().unwrap_or_default().trim());
     let first = fields
         .filter(|line| !line.is_empty())
-        .find(|line| !line.contains('='));
+        // Constants are not fields. A bound (ROS 2) is none.
+        .find(|line| !line.replace("<=", "").contains('='));
     let kind = first.and_then(|line| line.split_whitespace().next());
-    matches!(kind, Some("Header" | "std_msgs/Header"))
+    matches!(
+        kind,
+        Some("Header" | "std_msgs/Header" | "std_msgs/msg/Header")
+    )
 }
 
 /// How long ago a stamp was, by this machine's clock; zero for stamps of the future.
@@ -84,4 +103,50 @@ pub fn age(stamp: Stamp) -> Duration {
         u64::from(stamp.secs),
         stamp.nsecs.min(999_999_999),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    /// 3 s and 4 ns, in a header of ROS 2.
+    const STAMPED: [u8; 16] = [0, 1, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0];
+
+    fn message(of: &WireType, bytes: &'static [u8]) -> Message {
+        Message {
+            bytes: bytes.into(),
+            wire_type: Arc::new(of.clone()),
+            publisher: "/app".into(),
+            latching: false,
+        }
+    }
+
+    fn of_two(name: &str, digest: &str, definition: &str) -> WireType {
+        WireType::new(name, digest, definition).written_by(RosVersion::Two)
+    }
+
+    #[test]
+    fn stamps_of_ros_2_stand_behind_the_header_of_cdr() {
+        let mut stamps = Stamps::default();
+        let untold = of_two("p/msg/Found", "RIHS01_1", "");
+        let stamp = |stamps: &mut Stamps, of: &WireType| stamps.key(&message(of, &STAMPED));
+        assert_eq!(stamp(&mut stamps, &untold), None);
+        // Its publisher does not tell what it is; the cloud does.
+        let definition = "uint8 ALL=1\nstd_msgs/Header header\nstring<=8 name\n";
+        stamps.learn(&of_two("p/msg/Found", "RIHS01_1", definition));
+        let expected = Key::Stamp(Stamp { secs: 3, nsecs: 4 });
+        assert_eq!(stamp(&mut stamps, &untold), Some(expected.clone()));
+        let image = of_two("sensor_msgs/msg/Image", "RIHS01_2", "");
+        assert_eq!(stamp(&mut stamps, &image), Some(expected));
+        let named = of_two(
+            "p/msg/Named",
+            "RIHS01_3",
+            "string<=8 name\nstd_msgs/Header h\n",
+        );
+        assert!(!is_stamped(&named));
+        let cut = message(&image, &STAMPED[..8]);
+        assert_eq!(stamps.key(&cut), None);
+    }
 }

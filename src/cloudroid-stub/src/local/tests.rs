@@ -1,7 +1,6 @@
-//! With a real process (an ordinary ROS node, `examples/relay.rs`) and real Masters.
+//! With a real process (an ordinary node of either ROS, `examples/relay.rs`), and real Masters and domains.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,62 +8,51 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Event, HandOver, LocalState, Outcome, RequestId, SafeStop, Sla};
-use ros::bus::{Bus, GlobalParameters, Message, ParamValue, ServiceHandler, ServiceType, WireType};
-use ros::net::{HostSockets, Sockets};
-use ros::ros1::Ros1Bus;
-use ros::ros1::master::{Master, MasterOptions};
+use ros::bus::{Bus, Message, ParamValue, RosVersion, ServiceHandler, ServiceType};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::original::News;
 use super::process::Program;
-use super::{Application, Cloud, Interface, Keeper, Original, Setting};
+use super::{Answer, Application, Cloud, Interface, Keeper, Original, Setting};
+use crate::testing::{SOON, World, read, stories, string, string_type, text, written};
 
-/// Generous: it only bounds how long a failing test takes.
-pub const SOON: Duration = Duration::from_secs(120);
-
-/// A robot: a Master with a parameter, and a node on it.
-async fn robot() -> Arc<Ros1Bus> {
-    let listener = HostSockets
-        .listen(SocketAddr::from(([127, 0, 0, 1], 0)))
-        .await
-        .unwrap();
-    let address = listener.local_addr().unwrap();
-    let master = Master::new(MasterOptions {
-        uri: format!("http://{address}/"),
-        ..MasterOptions::default()
-    });
-    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
-    let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/robot")
-        .await
-        .unwrap();
-    let greeting = ParamValue::String("hello ".into());
-    bus.set("/ns/relay_sibling/greeting", greeting)
-        .await
-        .unwrap();
-    bus
+stories! {
+    of_ros_1 = One:
+        it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it,
+        a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left,
+        what_is_latched_while_the_link_is_away_reaches_both_sides,
+        a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over,
+        it_calls_what_the_robot_serves,
+        a_crash_is_told_and_it_comes_back,
+        what_cannot_run_is_said,
+        the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again,
+        a_call_is_answered_by_the_local_original_when_the_link_is_lost;
+    of_ros_2 = Two:
+        it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it,
+        a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left,
+        what_is_latched_while_the_link_is_away_reaches_both_sides,
+        a_crash_is_told_and_it_comes_back,
+        what_cannot_run_is_said,
+        the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again,
+        a_call_is_answered_by_the_local_original_when_the_link_is_lost;
 }
 
-pub fn string_type() -> WireType {
-    WireType::new(
-        "std_msgs/String",
-        "992ce8a1687cec8c8bd883ec73ca41d1",
-        "string data\n",
-    )
+/// A robot with a node on it, and, in ROS 1, a parameter.
+pub struct Robot {
+    pub world: World,
+    pub bus: Arc<dyn Bus>,
 }
 
-pub fn string(text: &str) -> Message {
-    let length = u32::try_from(text.len()).unwrap().to_le_bytes();
-    Message {
-        bytes: [&length[..], text.as_bytes()].concat().into(),
-        wire_type: Arc::new(string_type()),
-        publisher: "/app".into(),
-        latching: false,
+pub async fn robot(ros: RosVersion) -> Robot {
+    let world = World::new(ros).await;
+    let bus = world.node("/robot").await;
+    if let Ok(parameters) = bus.parameters() {
+        let greeting = ParamValue::String("hello ".into());
+        let name = "/ns/relay_sibling/greeting";
+        parameters.set(name, greeting).await.unwrap();
     }
-}
-
-pub fn text(message: &Message) -> String {
-    String::from_utf8(message.bytes[4..].to_vec()).unwrap()
+    Robot { world, bus }
 }
 
 /// The example stands beside the tests: `target/PROFILE/{examples,deps}`.
@@ -80,32 +68,47 @@ fn relay() -> PathBuf {
 }
 
 /// `/ns/relay`, from `/ns/in` to `/absolute/out`.
-pub fn setting(argv: &[&str]) -> Setting {
-    let names = ["in:=/ns/in", "out:=/absolute/out", "__name:=relay"];
-    let argv = argv.iter().chain(&names).copied();
+pub fn setting(world: &World, argv: &[&str]) -> Setting {
+    let names = match world.domain() {
+        None => "in:=/ns/in out:=/absolute/out __name:=relay",
+        Some(_) => {
+            "--ros-args -r in:=/ns/in -r out:=/absolute/out -r count:=/count -r __ns:=/ns -r __node:=relay"
+        }
+    };
+    let names = names.split(' ');
+    let argv = argv.iter().copied().chain(names).map(str::to_owned);
+    let (mut argv, mut environment) = (argv.collect::<Vec<_>>(), vec![]);
+    match world.domain() {
+        None => environment.push(("ROS_NAMESPACE", "/ns".into())),
+        Some(_) => argv.extend(["-p", "greeting:=hello "].map(str::to_owned)),
+    }
     Setting {
         program: Some(Program {
             path: relay(),
-            argv: argv.map(str::to_owned).collect(),
-            environment: vec![("ROS_NAMESPACE", "/ns".into())],
+            argv,
+            environment,
         }),
         node: "/ns/relay".into(),
+        domain: world.domain(),
     }
 }
 
-async fn an_original(
-    setting: Setting,
-    robot: Arc<Ros1Bus>,
-) -> (Original, mpsc::UnboundedReceiver<News>) {
+async fn an_original(robot: &Robot, setting: Setting) -> (Original, mpsc::UnboundedReceiver<News>) {
+    let string = string_type(robot.bus.version());
     let interface = Interface {
-        inputs: BTreeMap::from([("/ns/in".to_owned(), string_type())]),
+        inputs: BTreeMap::from([("/ns/in".to_owned(), string)]),
         awaited: BTreeSet::from(["/ns/in".to_owned()]),
         outputs: vec!["/absolute/out".into()],
-        services: vec![],
+        ..Interface::default()
     };
-    Original::new(setting, interface, robot, SOON)
+    Original::new(setting, interface, robot.bus.clone(), SOON)
         .await
         .unwrap()
+}
+
+/// The same, of the relay with these arguments.
+pub async fn a_relay(robot: &Robot, argv: &[&str]) -> (Original, mpsc::UnboundedReceiver<News>) {
+    an_original(robot, setting(&robot.world, argv)).await
 }
 
 async fn state(news: &mut mpsc::UnboundedReceiver<News>, wanted: LocalState) {
@@ -133,20 +136,19 @@ async fn output(news: &mut mpsc::UnboundedReceiver<News>) -> String {
     timeout(SOON, waiting).await.unwrap()
 }
 
-#[tokio::test]
-async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
-    let robot = robot().await;
-    let (original, mut news) = an_original(setting(&[]), robot.clone()).await;
+async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let (original, mut news) = a_relay(&robot, &[]).await;
     original.start();
     original.start();
     state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string("world"));
+    original.feed("/ns/in", &string(ros, "world"));
     assert_eq!(
         output(&mut news).await,
         "hello world",
-        "a sibling's parameter was copied"
+        "it has its parameters"
     );
-    let graph = robot.graph().borrow().clone();
+    let graph = robot.bus.graph().borrow().clone();
     assert_eq!(
         graph.nodes.keys().filter(|name| *name != "/robot").count(),
         0,
@@ -159,31 +161,33 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it() {
             .all(|name| name != "/absolute/out" && name != "/ns/in"),
         "{graph:?}"
     );
-    let parameters = robot.names().await.unwrap();
-    assert!(
-        parameters.iter().all(|name| name != "/ns/relay/seen"),
-        "what it writes stays with it: {parameters:?}"
-    );
+    if let Ok(parameters) = robot.bus.parameters() {
+        let names = parameters.names().await.unwrap();
+        assert!(
+            names.iter().all(|name| name != "/ns/relay/seen"),
+            "what it writes stays with it: {names:?}"
+        );
+    }
     original.stop();
     state(&mut news, LocalState::Stopped).await;
     original.start();
     state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string("again"));
+    original.feed("/ns/in", &string(ros, "again"));
     assert_eq!(output(&mut news).await, "hello again");
 }
 
 /// The same, of a publisher that latches.
-fn latched(publisher: &str, text: &str) -> Message {
+fn latched(ros: RosVersion, publisher: &str, text: &str) -> Message {
     Message {
         publisher: publisher.into(),
         latching: true,
-        ..string(text)
+        ..string(ros, text)
     }
 }
 
-#[tokio::test]
-async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left() {
-    let (original, mut news) = an_original(setting(&["patient"]), robot().await).await;
+async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let (original, mut news) = a_relay(&robot, &["patient", "keeps"]).await;
     let topic: Arc<str> = "/ns/in".into();
     for (publisher, said) in [
         ("/one", "old"),
@@ -191,7 +195,7 @@ async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(
         ("/two", "frames"),
         ("/gone", "lost"),
     ] {
-        original.latch(&topic, &latched(publisher, said));
+        original.latch(&topic, &latched(ros, publisher, said));
     }
     original.unlatch(&topic, &"/gone".into());
     for (left, wanted) in [
@@ -208,29 +212,29 @@ async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(
         }
         assert_eq!(heard, wanted.into_iter().map(str::to_owned).collect());
         // Nothing more came before this.
-        original.latch(&topic, &latched("/one", "map"));
+        original.latch(&topic, &latched(ros, "/one", "map"));
         assert_eq!(output(&mut news).await, "hello map");
         original.stop();
         state(&mut news, LocalState::Stopped).await;
     }
 }
 
-#[tokio::test]
-async fn what_is_latched_while_the_link_is_away_reaches_both_sides() {
+async fn what_is_latched_while_the_link_is_away_reaches_both_sides(ros: RosVersion) {
+    let robot = robot(ros).await;
     let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
     let (told, mut hears) = mpsc::unbounded_channel();
     let cloud = Arc::new(Silent::default());
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec![],
-        Some(an_original(setting(&["patient"]), robot().await).await),
+        Some(a_relay(&robot, &["patient", "keeps"]).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
-    keeper.input(&topic, latched("/map_server", "map"));
-    keeper.input(&topic, string("scan"));
+    keeper.input(&topic, latched(ros, "/map_server", "map"));
+    keeper.input(&topic, string(ros, "scan"));
     assert_eq!(cloud.inputs.lock().len(), 2);
     assert!(hears.try_recv().is_err(), "the cloud is alone");
     keeper.link_down();
@@ -239,16 +243,16 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides() {
         heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
     }
     assert!(!heard.contains(&"hello scan".to_owned()), "{heard:?}");
-    keeper.input(&topic, latched("/map_server", "another map"));
-    keeper.input(&topic, string("another scan"));
+    keeper.input(&topic, latched(ros, "/map_server", "another map"));
+    keeper.input(&topic, string(ros, "another scan"));
     for wanted in ["hello another map", "hello another scan"] {
         while !heard.iter().any(|heard| heard == wanted) {
             heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
         }
     }
     // What another node of the servant takes up is for the original all the same.
-    keeper.overheard(&topic, string("a sibling's scan"));
-    keeper.overheard(&topic, latched("/sibling", "a sibling's map"));
+    keeper.overheard(&topic, string(ros, "a sibling's scan"));
+    keeper.overheard(&topic, latched(ros, "/sibling", "a sibling's map"));
     for wanted in ["hello a sibling's scan", "hello a sibling's map"] {
         while !heard.iter().any(|heard| heard == wanted) {
             heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
@@ -269,22 +273,23 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides() {
 
 #[tokio::test]
 async fn a_stateful_hand_over_says_what_is_lost() {
+    let robot = robot(RosVersion::One).await;
     let sla = serde_json::json!({"t_desire": 10, "t_max": 20, "mode": "stateful"});
     let (told, mut hears) = mpsc::unbounded_channel();
     let cloud = Arc::new(Silent::default());
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec![],
-        Some(an_original(setting(&["patient"]), robot().await).await),
+        Some(a_relay(&robot, &["patient"]).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
     // What is latched reaches both: nothing of it is lost.
-    keeper.input(&topic, latched("/map_server", "map"));
+    keeper.input(&topic, latched(RosVersion::One, "/map_server", "map"));
     for _ in 0..3 {
-        keeper.input(&topic, string("scan"));
+        keeper.input(&topic, string(RosVersion::One, "scan"));
     }
     let mut heard = Vec::new();
     let mut until = async |wanted: &str| {
@@ -300,7 +305,7 @@ async fn a_stateful_hand_over_says_what_is_lost() {
         "{lost}"
     );
     for _ in 0..2 {
-        keeper.input(&topic, string("another scan"));
+        keeper.input(&topic, string(RosVersion::One, "another scan"));
     }
     keeper.link_up(true);
     until("cloud lacks 2 of /ns/in").await;
@@ -332,20 +337,24 @@ async fn where_nothing_is_promised_a_missing_original_is_told_when_it_is_needed(
     assert!(keeper.report().summary.contains("nobody answers"));
 }
 
-#[tokio::test]
-async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over() {
-    let robot = robot().await;
+async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over(ros: RosVersion) {
+    let robot = robot(ros).await;
     let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
-    let _hangs = robot.serve("/hangs", of, Arc::new(Hangs)).await.unwrap();
+    let _hangs = robot
+        .bus
+        .serve("/hangs", of, Arc::new(Hangs))
+        .await
+        .unwrap();
     let limit = Duration::from_millis(100);
-    let original = Original::new(setting(&["patient"]), Interface::default(), robot, limit);
+    let relay = setting(&robot.world, &["patient"]);
+    let original = Original::new(relay, Interface::default(), robot.bus, limit);
     let (original, mut news) = original.await.unwrap();
     let interface = Interface {
         outputs: vec!["/absolute/out".into()],
         ..Interface::default()
     };
     original.adapt(interface).await.unwrap();
-    original.latch(&"/ns/in".into(), &latched("/app", "ask /hangs"));
+    original.latch(&"/ns/in".into(), &latched(ros, "/app", "ask /hangs"));
     original.start();
     let answer = output(&mut news).await;
     assert!(
@@ -375,16 +384,15 @@ impl ServiceHandler for Says {
     }
 }
 
-#[tokio::test]
-async fn it_calls_what_the_robot_serves() {
-    let robot = robot().await;
-    let (original, mut news) = an_original(setting(&[]), robot.clone()).await;
+async fn it_calls_what_the_robot_serves(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let (original, mut news) = a_relay(&robot, &[]).await;
     original.start();
     state(&mut news, LocalState::Ready).await;
     let mut served = Vec::new();
     for (name, says) in [("/secret", Ok("42")), ("/silent", Err("it is a secret"))] {
         let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
-        let serving = robot.serve(name, of, Arc::new(Says(says))).await;
+        let serving = robot.bus.serve(name, of, Arc::new(Says(says))).await;
         served.push(serving.unwrap());
     }
     for (asked, wanted) in [
@@ -392,18 +400,18 @@ async fn it_calls_what_the_robot_serves() {
         ("ask /silent", "it is a secret"),
         ("ask /nobody", "service /nobody has no server"),
     ] {
-        original.feed("/ns/in", &string(asked));
+        original.feed("/ns/in", &string(ros, asked));
         let answer = output(&mut news).await;
         assert!(answer.contains(wanted), "{answer}");
     }
 }
 
-#[tokio::test]
-async fn a_crash_is_told_and_it_comes_back() {
-    let (original, mut news) = an_original(setting(&["crash-on=boom"]), robot().await).await;
+async fn a_crash_is_told_and_it_comes_back(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let (original, mut news) = a_relay(&robot, &["crash-on=boom"]).await;
     original.start();
     state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string("boom"));
+    original.feed("/ns/in", &string(ros, "boom"));
     let crashed = async {
         loop {
             if let News::Crashed(reason) = news.recv().await.unwrap() {
@@ -414,21 +422,21 @@ async fn a_crash_is_told_and_it_comes_back() {
     let reason = timeout(SOON, crashed).await.unwrap();
     assert!(reason.contains('3'), "{reason}");
     state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string("world"));
+    original.feed("/ns/in", &string(ros, "world"));
     assert_eq!(output(&mut news).await, "hello world");
 }
 
-#[tokio::test]
-async fn what_cannot_run_is_said() {
-    let mut missing = setting(&[]);
+async fn what_cannot_run_is_said(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let mut missing = setting(&robot.world, &[]);
     missing.program = None;
-    let (original, mut news) = an_original(missing, robot().await).await;
+    let (original, mut news) = an_original(&robot, missing).await;
     original.start();
     state(&mut news, LocalState::Missing).await;
 
-    let mut broken = setting(&[]);
+    let mut broken = setting(&robot.world, &[]);
     broken.program.as_mut().unwrap().path = "/nonexistent/relay".into();
-    let (original, mut news) = an_original(broken, robot().await).await;
+    let (original, mut news) = an_original(&robot, broken).await;
     original.start();
     let said = async {
         loop {
@@ -455,6 +463,10 @@ impl Cloud for Silent {
 
     fn call(&self, request: RequestId, _: &str, _: Bytes) {
         self.calls.lock().push(request);
+    }
+
+    fn ask(&self, _: &str, _: Bytes) -> Answer {
+        Box::pin(std::future::pending())
     }
 }
 
@@ -490,9 +502,10 @@ impl Application for Listener {
     fn told(&self, _: &Outcome) {}
 }
 
-#[tokio::test]
-async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again() {
-    let robot = robot().await;
+async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again(
+    ros: RosVersion,
+) {
+    let robot = robot(ros).await;
     let sla = serde_json::json!({
         "t_desire": 0.02, "t_max": 0.05, "local": "cold", "initial": 5,
         "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"},
@@ -502,18 +515,18 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
-        Some(an_original(setting(&[]), robot).await),
+        Some(a_relay(&robot, &[]).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
-    keeper.input(&topic, string("lost"));
+    keeper.input(&topic, string(ros, "lost"));
     for expected in ["stop on /cmd_vel", "start", "feed"] {
         let heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
         assert_eq!(heard, expected);
     }
-    keeper.input(&topic, string("world"));
+    keeper.input(&topic, string(ros, "world"));
     let mut heard = String::new();
     while heard != "hello world" {
         heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
@@ -526,8 +539,8 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     // The cloud answers again, in time, until Q is above its threshold.
     let stopped = async {
         while heard != "stop" {
-            keeper.input(&topic, string("x"));
-            keeper.cloud_output("/absolute/out", &string("cloud"), None);
+            keeper.input(&topic, string(ros, "x"));
+            keeper.cloud_output("/absolute/out", &string(ros, "cloud"), None);
             // What the original answers to them may be too late to be heard.
             tokio::task::yield_now().await;
             while heard != "stop" {
@@ -547,15 +560,15 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     );
 }
 
-#[tokio::test]
-async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
+async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost(ros: RosVersion) {
+    let robot = robot(ros).await;
     let sla = serde_json::json!({"t_desire": 0.05, "t_max": 0.1, "local": "warm", "initial": 5});
     let (told, mut hears) = mpsc::unbounded_channel();
     let cloud = Arc::new(Silent::default());
     let keeper = Keeper::start(
         Sla::parse(sla).unwrap(),
         vec![],
-        Some(an_original(setting(&[]), robot().await).await),
+        Some(a_relay(&robot, &[]).await),
         cloud.clone(),
         Arc::new(Listener(told)),
     );
@@ -563,7 +576,7 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
     let service: Arc<str> = "/ns/relay/echo".into();
     let call = {
         let (keeper, service) = (keeper.clone(), service.clone());
-        tokio::spawn(async move { keeper.call(&service, Bytes::from_static(b"request")).await })
+        tokio::spawn(async move { keeper.call(&service, written(ros, "request")).await })
     };
     while cloud.calls.lock().is_empty() {
         tokio::task::yield_now().await;
@@ -571,7 +584,8 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost() {
     assert_eq!(hears.recv().await.unwrap(), "start");
     keeper.link_down();
     let answer = timeout(SOON, call).await.unwrap().unwrap();
-    assert_eq!(answer, Ok(Bytes::from_static(b"request")));
+    let answer = answer.map(|answer| read(ros, &answer));
+    assert_eq!(answer.as_deref(), Ok("request"));
     let id = cloud.calls.lock()[0];
     keeper.cloud_answered(id, Ok(Bytes::from_static(b"late")), None);
     assert_eq!(keeper.report().counts.from_local, 1);

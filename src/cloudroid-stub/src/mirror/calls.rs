@@ -9,17 +9,17 @@ use link::clock::now;
 use link::control::Served;
 use parking_lot::Mutex;
 use qos::{Failure, RequestId};
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::ServiceHandler;
 use tokio::sync::{oneshot, watch};
 
 use super::{Mirror, reports};
-use crate::local::Keeper;
+use crate::local::{Answer, Keeper, ServiceUse};
 
 /// Services by name, and calls under way.
 #[derive(Default)]
 pub struct Calls {
     services: Mutex<HashMap<String, Service>>,
-    waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, String>>>>,
+    waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, Failure>>>>,
     /// Calls that the keeper has made: the link's id → the keeper's.
     kept: Mutex<HashMap<u32, (RequestId, i64)>>,
     /// Calls of the keeper that wait for their service's channel.
@@ -27,7 +27,8 @@ pub struct Calls {
 }
 
 struct Service {
-    md5: String,
+    /// As it was told.
+    told: Served,
     /// Its number in this session; none until the cloud has told it.
     channel: Arc<watch::Sender<Option<u32>>>,
     _serving: Box<dyn Send + Sync>,
@@ -51,7 +52,7 @@ impl Calls {
             return;
         }
         if let Some(caller) = self.waiting.lock().remove(&id) {
-            let _ = caller.send(response);
+            let _ = caller.send(response.map_err(Failure::Refused));
         }
     }
 
@@ -74,7 +75,7 @@ impl Calls {
             }
         }
         for (_, caller) in self.waiting.lock().drain() {
-            let _ = caller.send(Err(reason.to_owned()));
+            let _ = caller.send(Err(Failure::Unreachable(reason.to_owned())));
         }
     }
 
@@ -99,6 +100,21 @@ impl Calls {
         kept.insert(id, (request, now()));
     }
 
+    /// Calls what is not measured, and gives the answer. Waits until the cloud has told of the service.
+    pub fn ask(&self, mirror: &Mirror, service: &str, request: Bytes) -> Answer {
+        let known = self.services.lock();
+        match known.get(service) {
+            Some(known) => {
+                let channel = known.channel.subscribe();
+                Box::pin(asked(mirror.this.clone(), channel, request))
+            }
+            None => {
+                let gone = format!("the node does not serve {service} any more");
+                Box::pin(async move { Err(Failure::Unreachable(gone)) })
+            }
+        }
+    }
+
     /// Serves what is new and takes back what is gone, unless it `keeps` that for the time being. `told`: the channels
     /// are the cloud's, else it knows of none yet.
     pub async fn apply(
@@ -107,9 +123,15 @@ impl Calls {
         services: &[Served],
         (told, keeps): (bool, bool),
     ) {
+        let version = mirror.bus.version();
         self.services.lock().retain(|name, service| {
             let listed = services.iter().find(|served| served.name == *name);
-            listed.map_or(keeps, |served| served.md5 == service.md5)
+            // More of a type may have become known.
+            let same = |served: &Served| {
+                let of = |served: &Served| served.service_type(version);
+                served.type_name == service.told.type_name && of(served).agrees(&of(&service.told))
+            };
+            listed.map_or(keeps, same)
         });
         for served in services {
             if let Some(known) = self.services.lock().get(&served.name) {
@@ -120,13 +142,14 @@ impl Calls {
             let handler = Arc::new(Forward {
                 mirror: Arc::downgrade(mirror),
                 name: served.name.as_str().into(),
+                what: ServiceUse::of(served, version),
                 channel: channel.clone(),
             });
-            let service_type = ServiceType::new(served.type_name.clone(), served.md5.clone());
+            let service_type = served.service_type(version);
             match mirror.bus.serve(&served.name, service_type, handler).await {
                 Ok(serving) => {
                     let service = Service {
-                        md5: served.md5.clone(),
+                        told: served.clone(),
                         channel,
                         _serving: serving,
                     };
@@ -143,56 +166,77 @@ impl Calls {
     }
 }
 
-/// Passes calls to the cloud.
+/// Calls the cloud by a channel that it may not have told yet.
+async fn asked(
+    mirror: Weak<Mirror>,
+    mut channels: watch::Receiver<Option<u32>>,
+    request: Bytes,
+) -> Result<Bytes, Failure> {
+    let ended = || Failure::Unreachable("the node is ending".to_owned());
+    let (sender, answer) = oneshot::channel();
+    let id = loop {
+        let known = channels.wait_for(Option::is_some).await;
+        drop(known.map_err(|_| ended())?);
+        let mirror = mirror.upgrade().ok_or_else(ended)?;
+        // The answer may come at once: it must find its caller. A session that begins now fails all that wait.
+        let mut waiting = mirror.calls.waiting.lock();
+        let Some(channel) = *channels.borrow() else {
+            continue;
+        };
+        let id = mirror.session().call(channel, request);
+        waiting.insert(id, sender);
+        break id;
+    };
+    let abandoned = Abandoned { mirror, id };
+    let answer = answer.await.unwrap_or_else(|_| Err(ended()));
+    drop(abandoned);
+    answer
+}
+
+/// Passes calls to the cloud, or to who keeps the promise.
 struct Forward {
     mirror: Weak<Mirror>,
     name: Arc<str>,
+    what: ServiceUse,
     channel: Arc<watch::Sender<Option<u32>>>,
 }
 
 #[async_trait]
 impl ServiceHandler for Forward {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let ended = || "the node is ending".to_owned();
-        let mirror = self.mirror.upgrade().ok_or_else(ended)?;
-        if let Some(keeper) = mirror.keeper() {
-            return keeper.call(&self.name, request).await;
+        let keeper = {
+            let mirror = self.mirror.upgrade();
+            let mirror = mirror.ok_or_else(|| "the node is ending".to_owned())?;
+            mirror.keeper().cloned()
+        };
+        let Some(keeper) = keeper else {
+            let channels = self.channel.subscribe();
+            let answer = asked(self.mirror.clone(), channels, request).await;
+            return answer.map_err(|failure| failure.text().to_owned());
+        };
+        match &self.what {
+            ServiceUse::Request => keeper.call(&self.name, request).await,
+            ServiceUse::Look => keeper.pass(&self.name, request).await,
+            ServiceUse::Set | ServiceUse::Transition => {
+                keeper.manage(&self.name, &self.what, request).await
+            }
+            ServiceUse::SendGoal(action) => keeper.send_goal(action, request).await,
+            ServiceUse::GetResult(action) => keeper.get_result(action, request).await,
+            ServiceUse::CancelGoal(action) => keeper.cancel_goal(action, request).await,
         }
-        let (sender, answer) = oneshot::channel();
-        let id = loop {
-            let mut channels = self.channel.subscribe();
-            let known = channels
-                .wait_for(Option::is_some)
-                .await
-                .map_err(|_| ended())?;
-            drop(known);
-            // The answer may come at once: it must find its caller. A session that begins now fails all that wait.
-            let mut waiting = mirror.calls.waiting.lock();
-            let Some(channel) = *self.channel.borrow() else {
-                continue;
-            };
-            let id = mirror.session().call(channel, request);
-            waiting.insert(id, sender);
-            break id;
-        };
-        let abandoned = Abandoned {
-            mirror: &mirror,
-            id,
-        };
-        let answer = answer.await.unwrap_or_else(|_| Err(ended()));
-        drop(abandoned);
-        answer
     }
 }
 
 /// Forgets a call whose caller has gone.
-struct Abandoned<'a> {
-    mirror: &'a Mirror,
+struct Abandoned {
+    mirror: Weak<Mirror>,
     id: u32,
 }
 
-impl Drop for Abandoned<'_> {
+impl Drop for Abandoned {
     fn drop(&mut self) {
-        self.mirror.calls.waiting.lock().remove(&self.id);
+        if let Some(mirror) = self.mirror.upgrade() {
+            mirror.calls.waiting.lock().remove(&self.id);
+        }
     }
 }

@@ -6,9 +6,9 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use qos::{Local, LocalState, Report};
-use ros::bus::{Bus, BusError, Publisher, Qos, WireType};
+use ros::bus::{Bus, BusError, Publisher, Qos, RosVersion, WireType};
 use ros::codec::{self, FillOptions, Time};
-use ros::schema::MessageType;
+use ros::schema::{MessageType, Registry};
 use serde_json::json;
 
 const TOPIC: &str = "/diagnostics";
@@ -17,30 +17,19 @@ const OK: u8 = 0;
 const WARN: u8 = 1;
 const ERROR: u8 = 2;
 
-const DEFINITION: &str = "\
-Header header
-DiagnosticStatus[] status
-================================================================================
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-================================================================================
-MSG: diagnostic_msgs/DiagnosticStatus
-byte OK=0
-byte WARN=1
-byte ERROR=2
-byte STALE=3
-byte level
-string name
-string message
-string hardware_id
-KeyValue[] values
-================================================================================
-MSG: diagnostic_msgs/KeyValue
-string key
-string value
-";
+/// The same in both ROSes, but for headers, which each has of its own.
+const DEFINITIONS: [(&str, &str); 3] = [
+    (
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "std_msgs/Header header\nDiagnosticStatus[] status\n",
+    ),
+    (
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n\
+         byte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values\n",
+    ),
+    ("diagnostic_msgs/msg/KeyValue", "string key\nstring value\n"),
+];
 
 /// One node's entry in `/diagnostics`.
 pub struct Diagnostics {
@@ -56,7 +45,7 @@ pub struct Diagnostics {
 impl Diagnostics {
     /// Advertises it on `bus`, for the node of this name.
     pub async fn new(bus: &Arc<dyn Bus>, node: &str, robot: &str) -> Result<Self, BusError> {
-        let schema = schema();
+        let schema = schema(bus.version());
         let of = WireType::of(&schema);
         Ok(Self {
             publisher: bus.advertise(TOPIC, of, Qos::keep_last(2)).await?,
@@ -75,8 +64,13 @@ impl Diagnostics {
     }
 }
 
-fn schema() -> Arc<MessageType> {
-    match MessageType::from_full_text("diagnostic_msgs/DiagnosticArray", DEFINITION) {
+fn schema(version: RosVersion) -> Arc<MessageType> {
+    let registry = Registry::of(version);
+    let known = DEFINITIONS
+        .iter()
+        .try_for_each(|(key, text)| registry.insert(key, text))
+        .and_then(|()| registry.message(DEFINITIONS[0].0));
+    match known {
         Ok(schema) => schema,
         Err(error) => unreachable!("the definition is ours: {error}"),
     }
@@ -154,8 +148,14 @@ fn values(report: &Report) -> Vec<(String, String)> {
 fn array(of: &MessageType, sequence: u32, name: &str, robot: &str, report: &Report) -> Bytes {
     let Time { secs, nsecs } = Time::now();
     let value = |(key, value)| json!({ "key": key, "value": value });
+    let header = match of.version() {
+        RosVersion::One => {
+            json!({ "seq": sequence, "stamp": { "secs": secs, "nsecs": nsecs } })
+        }
+        RosVersion::Two => json!({ "stamp": { "sec": secs, "nanosec": nsecs } }),
+    };
     let said = json!({
-        "header": { "seq": sequence, "stamp": { "secs": secs, "nsecs": nsecs } },
+        "header": header,
         "status": [{
             "level": level(report),
             "name": name,
@@ -179,8 +179,24 @@ mod tests {
     use std::time::Instant;
 
     #[test]
+    fn robots_of_ros_2_are_told_in_its_form() {
+        let known = schema(RosVersion::Two);
+        assert_eq!(known.name(), "diagnostic_msgs/msg/DiagnosticArray");
+        let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
+        let governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let report = governor.report(Instant::now());
+        let told = array(&known, 1, "detect: cloudroid", "rover1", &report);
+        assert_eq!(told[..4], [0, 1, 0, 0]);
+        let mut json = Vec::new();
+        ros::codec::to_json(&known, &told, &mut json, &Default::default()).unwrap();
+        let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
+        assert!(json["header"]["stamp"]["sec"].as_u64() > Some(1_600_000_000));
+        assert_eq!(json["status"][0]["level"], ERROR);
+    }
+
+    #[test]
     fn the_array_is_what_its_definition_says() {
-        let known = schema();
+        let known = schema(RosVersion::One);
         assert_eq!(known.md5(), "60810da900de1dd6ddd437c3503511da");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
         let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());

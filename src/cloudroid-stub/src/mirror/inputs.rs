@@ -47,7 +47,7 @@ impl Inputs {
         let mut topics = self.topics.lock();
         topics.retain(|name, topic| {
             let listed = inputs.iter().find(|wanted| wanted.topic == *name);
-            listed.map_or(others_need, |wanted| wanted.md5 == topic.wanted.md5)
+            listed.map_or(others_need, |wanted| suffices(&topic.wanted, wanted))
         });
         // Subscribed to anew, a topic gets new channels.
         self.channels.lock().retain(|name, channels| {
@@ -192,16 +192,34 @@ impl Inputs {
     }
 }
 
+/// Whether a subscription that was made for one wish does for another: whoever asks for more hears those who offer less, too, and
+/// what was heard once is not to come again.
+fn suffices(made: &Wanted, wanted: &Wanted) -> bool {
+    let enough = match (&made.qos, &wanted.qos) {
+        (Some(made), Some(wanted)) => {
+            (made.transient_local || !wanted.transient_local)
+                && (!made.best_effort || wanted.best_effort)
+        }
+        (None, _) => true,
+        (Some(_), None) => false,
+    };
+    made.md5 == wanted.md5 && enough
+}
+
 async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicBool>) {
     let Some(bus) = mirror.upgrade().map(|mirror| mirror.bus.clone()) else {
         return;
     };
-    let of = match wanted.type_name.as_str() {
-        "*" => WireType::any(),
-        name => WireType::new(name, &wanted.md5, ""),
+    let of = match mirror.upgrade() {
+        Some(mirror) => mirror.wire_type(&wanted.type_name, &wanted.md5),
+        None => return,
     };
-    // Whatever is latched goes to the cloud, too.
-    let qos = Qos::keep_last(QUEUE).latching(true);
+    let qos = match &wanted.qos {
+        // Publishers of ROS 2 log whom they do not suit: no more is asked for than the node does.
+        Some(qos) => qos.to_qos(QUEUE),
+        // Whatever is latched goes to the cloud, too.
+        None => Qos::keep_last(QUEUE).latching(true),
+    };
     let mut subscription = match bus.subscribe(&wanted.topic, of, qos).await {
         Ok(subscription) => subscription,
         Err(error) => {
@@ -218,16 +236,17 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
     // Who is there already is no change.
     present.mark_changed();
     let mut latching: BTreeSet<PeerId> = BTreeSet::new();
+    // Who is there, as it has changed: looked at when all that had come by then was read.
+    let mut changed: Option<Matched> = None;
     loop {
         let message = tokio::select! {
             // Who has left has sent all that it had before.
             biased;
             message = subscription.messages.recv() => message,
-            changed = present.changed() => {
-                let Some(mirror) = mirror.upgrade().filter(|_| changed.is_ok()) else {
+            () = std::future::ready(()), if changed.is_some() => {
+                let (Some(mirror), Some(present)) = (mirror.upgrade(), changed.take()) else {
                     return;
                 };
-                let present = present.borrow_and_update().clone();
                 // First, or one that has left might be expected again.
                 mirror.inputs.offered(&topic, &present);
                 mirror.inputs.left(&mirror, &topic, &present);
@@ -243,10 +262,21 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
                 });
                 continue;
             }
+            change = present.changed() => {
+                if change.is_err() {
+                    return;
+                }
+                changed = Some(present.borrow_and_update().clone());
+                continue;
+            }
         };
         let (Some(message), Some(mirror)) = (message, mirror.upgrade()) else {
             return;
         };
+        // One that has left meanwhile: what is opened for its last message is closed again behind it.
+        if !present.borrow().contains(&message.publisher) {
+            changed = Some(present.borrow().clone());
+        }
         if message.latching && !latching.contains(&message.publisher) {
             latching.insert(message.publisher.clone());
         }
@@ -311,12 +341,17 @@ impl Channels {
         let key = (latching.then(|| publisher.clone()), of.digest.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
+            // Publishers of ROS 2 do not tell it; the cloud may have.
+            let definition = match of.definition.is_empty() {
+                true => mirror.wire_type(&of.name, of.digest.as_str()).definition,
+                false => of.definition.clone(),
+            };
             mirror.session().report(&FromRobot::Open(Input {
                 channel,
                 topic: topic.to_owned(),
                 type_name: of.name.clone(),
                 md5: of.digest.to_string(),
-                definition: of.definition.clone(),
+                definition,
                 latching,
                 qos: None,
             }));

@@ -12,7 +12,7 @@ use parking_lot::Mutex;
 use ros::bus::{BusError, CallFate, Digest, Graph, ServiceProvider};
 
 use super::Mirror;
-use crate::local;
+use crate::{local, seen};
 
 /// What the cloud was told of.
 #[derive(Default)]
@@ -103,7 +103,7 @@ impl LentServices {
         let this = mirror.this.clone();
         tokio::spawn(async move {
             let Some(mirror) = this.upgrade() else { return };
-            let limit = mirror.call_limit;
+            let limit = local::limit(&name, mirror.call_limit);
             let called = mirror.bus.call_typed(&name, &digest, request, limit).await;
             if called.as_ref().is_err_and(is_of_the_provider) {
                 mirror
@@ -137,9 +137,8 @@ impl LentServices {
 
     fn compare(&self, mirror: &Mirror, graph: &Graph) {
         let services = self.services.lock();
-        let elsewhere = |(name, service): &(&String, &Service)| {
-            graph.services.get(*name) != Some(&service.node)
-        };
+        let elsewhere =
+            |(name, service): &(&String, &Service)| !seen::serves(graph, &service.node, name);
         let gone: Vec<u32> = services
             .iter()
             .filter(elsewhere)
@@ -159,7 +158,8 @@ impl Mirror {
         service: &str,
         provider: ServiceProvider,
     ) -> Result<ServiceProvider, String> {
-        if provider.label.as_ref() == Some(&self.label) {
+        let own = provider.node == self.bus.node();
+        if own || provider.label.as_ref() == Some(&self.label) {
             return Err(format!("{service} is served by this very servant"));
         }
         // Stubs of an earlier version do not tell.

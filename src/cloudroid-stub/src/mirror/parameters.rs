@@ -32,6 +32,10 @@ impl Parameters {
 
 /// All parameters now, and from now on their changes go to the cloud.
 pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
+    // Nodes of ROS 2 share no parameters, and are told their own on the command line.
+    if mirror.bus.parameters().is_err() {
+        return BTreeMap::new();
+    }
     let watching = async { mirror.bus.parameters()?.watch().await };
     match watching.await {
         Ok(mut changes) => {

@@ -9,10 +9,10 @@ use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
-    Correlation, Event, HandOver, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side, Sla,
-    Topic, Warm,
+    Correlation, Event, Failure, HandOver, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side,
+    Sla, Topic, Warm,
 };
-use ros::bus::{Bus, Message, WireType};
+use ros::bus::{Bus, Message, Qos, WireType};
 use serde_json::json;
 
 use super::Mirror;
@@ -20,12 +20,14 @@ use super::diagnostics::Diagnostics;
 use super::reports::{self, Reports};
 use super::safe_stop::{self, Stop};
 use crate::config::{self, Config};
-use crate::local::{self, Application, Cloud, Interface, Keeper, Original, Setting};
+use crate::local::{self, Answer, Application, Cloud, Interface, Keeper, Original, Setting};
 
 /// What is known of the interface so far: lazy inputs become known later, and do not go again.
 #[derive(Default)]
 pub struct Known {
     inputs: BTreeMap<String, WireType>,
+    /// The quality of service that the node asks for, where that is told.
+    asked: BTreeMap<String, Qos>,
     outputs: BTreeMap<String, WireType>,
     told: BTreeSet<String>,
 }
@@ -188,23 +190,24 @@ impl Mirror {
         };
         let (pairs, interface) = {
             let mut known = promise.known.lock();
-            let types = self.types.lock();
-            let wire_type = |name: &str, md5: &str| {
-                let known = types.get(&(name.to_owned(), md5.to_owned())).cloned();
-                known.unwrap_or_else(|| WireType::new(name, md5, ""))
-            };
             for input in graph
                 .inputs
                 .iter()
                 .filter(|input| input.feed && input.type_name != "*")
             {
-                let found = wire_type(&input.type_name, &input.md5);
+                let found = self.wire_type(&input.type_name, &input.md5);
                 known.inputs.insert(input.topic.clone(), found);
+                if let Some(qos) = &input.qos {
+                    let asked = qos.to_qos(local::QUEUE);
+                    known.asked.insert(input.topic.clone(), asked);
+                }
             }
             for output in &graph.outputs {
-                let found = wire_type(&output.type_name, &output.md5);
+                let found = self.wire_type(&output.type_name, &output.md5);
                 known.outputs.insert(output.topic.clone(), found);
             }
+            let types = known.inputs.values().chain(known.outputs.values());
+            promise.keeper.learn_types(types);
             let mut found = known.find(promise.answers.as_deref());
             if promise.of_link {
                 // A goal is done by one side or the other; of all else only who speaks counts.
@@ -219,6 +222,7 @@ impl Mirror {
             let answered = |name: &&String| found.pairs.iter().any(|pair| pair.input == **name);
             let interface = Interface {
                 inputs: known.inputs.clone(),
+                asked: known.asked.clone(),
                 awaited: known.inputs.keys().filter(answered).cloned().collect(),
                 outputs: known.outputs.keys().cloned().collect(),
                 services: graph
@@ -275,7 +279,7 @@ impl Promise {
 fn topics(known: &BTreeMap<String, WireType>) -> Vec<Topic> {
     let topic = |(name, wire_type): (&String, &WireType)| Topic {
         name: name.clone(),
-        type_name: wire_type.name.clone(),
+        type_name: wire_type.name.replacen("/msg/", "/", 1),
         stamped: local::is_stamped(wire_type),
     };
     known.iter().map(topic).collect()
@@ -316,6 +320,16 @@ impl Cloud for Way {
     fn call(&self, request: RequestId, service: &str, bytes: Bytes) {
         if let Some(mirror) = self.0.upgrade() {
             mirror.calls.kept(&mirror, request, service, bytes);
+        }
+    }
+
+    fn ask(&self, service: &str, bytes: Bytes) -> Answer {
+        match self.0.upgrade() {
+            Some(mirror) => mirror.calls.ask(&mirror, service, bytes),
+            None => Box::pin(async {
+                let ending = "the node is ending".to_owned();
+                Err(Failure::Unreachable(ending))
+            }),
         }
     }
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use bytes::Bytes;
 use qos::SafeStop;
-use ros::bus::{Bus, Publisher, Qos, WireType};
+use ros::bus::{Bus, Publisher, Qos, RosVersion, WireType};
 use ros::schema::{MessageType, Registry, SchemaError};
 
 /// The usual one; robots without development packages have no definitions at all.
@@ -30,7 +30,8 @@ pub struct Stop {
 impl Stop {
     /// For a message whose type is given, whoever else publishes on its topic.
     pub async fn new(stop: &SafeStop, bus: &Arc<dyn Bus>) -> anyhow::Result<Self> {
-        let of = definition(&stop.type_name, &shares())
+        let version = bus.version();
+        let of = definition(version, &stop.type_name, &shares(version))
             .with_context(|| format!("safe_stop: {} is not known on this robot", stop.type_name))?;
         let json = serde_json::to_vec(&stop.message)?;
         let mut bytes = Vec::new();
@@ -50,30 +51,40 @@ impl Stop {
     }
 }
 
-/// A message of zeros.
+/// A message of zeros; of ROS 2, of what its definition gives fields that nobody sets.
 pub fn zeros(wire_type: &WireType) -> Result<Bytes, String> {
-    let of = MessageType::from_full_text(&wire_type.name, &wire_type.definition);
-    let of = of.map_err(|error| error.to_string())?;
-    Ok(vec![0; of.min_size()].into())
+    let of = wire_type.schema().map_err(|error| error.to_string())?;
+    if of.version() == RosVersion::One {
+        return Ok(vec![0; of.min_size()].into());
+    }
+    let mut bytes = Vec::new();
+    ros::codec::from_json(&of, b"{}", &mut bytes, &Default::default())
+        .map_err(|error| error.to_string())?;
+    Ok(bytes.into())
 }
 
 /// Directories that hold packages' definitions.
-fn shares() -> Vec<PathBuf> {
+fn shares(version: RosVersion) -> Vec<PathBuf> {
     let named = |name: &str| -> Vec<PathBuf> {
         let value = std::env::var_os(name).unwrap_or_default();
         std::env::split_paths(&value).collect()
     };
-    let mut shares = named("ROS_PACKAGE_PATH");
-    let prefixes = named("CMAKE_PREFIX_PATH")
-        .into_iter()
-        .chain(["/usr".into()]);
+    let (mut shares, prefixes) = match version {
+        RosVersion::One => (named("ROS_PACKAGE_PATH"), named("CMAKE_PREFIX_PATH")),
+        RosVersion::Two => (Vec::new(), named("AMENT_PREFIX_PATH")),
+    };
+    let prefixes = prefixes.into_iter().chain(["/usr".into()]);
     shares.extend(prefixes.map(|prefix| prefix.join("share")));
     shares
 }
 
 /// A type with all it contains, from the robot's packages.
-fn definition(type_name: &str, shares: &[PathBuf]) -> anyhow::Result<Arc<MessageType>> {
-    let registry = Registry::new();
+fn definition(
+    version: RosVersion,
+    type_name: &str,
+    shares: &[PathBuf],
+) -> anyhow::Result<Arc<MessageType>> {
+    let registry = Registry::of(version);
     for (key, text) in TWIST {
         registry.insert(key, text)?;
     }
@@ -129,9 +140,29 @@ mod tests {
             std::fs::write(path, text).unwrap();
         }
         let shares = [place.path().to_owned()];
-        assert_eq!(definition("a_msgs/Halt", &shares).unwrap().min_size(), 49);
-        let twist = definition("geometry_msgs/Twist", &[]).unwrap();
+        let of_one = |name: &str, shares: &[PathBuf]| definition(RosVersion::One, name, shares);
+        assert_eq!(of_one("a_msgs/Halt", &shares).unwrap().min_size(), 49);
+        let twist = of_one("geometry_msgs/Twist", &[]).unwrap();
         assert_eq!(twist.md5(), "9f195f881246fdfa2798d1d3eebca84a");
-        assert!(definition("c_msgs/None", &shares).is_err());
+        assert!(of_one("c_msgs/None", &shares).is_err());
+        // The same files, and other names and hashes.
+        let of_two = |name: &str| definition(RosVersion::Two, name, &shares).unwrap();
+        assert_eq!(of_two("a_msgs/Halt").name(), "a_msgs/msg/Halt");
+        let twist = of_two("geometry_msgs/msg/Twist");
+        assert_eq!(
+            twist.digest(),
+            "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
+        );
+    }
+
+    #[test]
+    fn zeros_of_ros_2_are_cdr() {
+        let of = definition(RosVersion::Two, "geometry_msgs/Twist", &[]).unwrap();
+        let zeros = zeros(&WireType::of(&of)).unwrap();
+        assert_eq!(zeros.len(), 4 + 6 * 8);
+        assert_eq!(
+            (&zeros[..4], zeros[4..].iter().max()),
+            (&[0, 1, 0, 0][..], Some(&0))
+        );
     }
 }

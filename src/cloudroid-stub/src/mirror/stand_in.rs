@@ -3,8 +3,8 @@
 
 use std::sync::{Arc, Weak};
 
-use link::control::{Graph, Output, Served, Wanted};
-use ros::bus::{ServiceType, WireType};
+use link::control::{self, Graph, Output, Served, Wanted};
+use ros::bus::{Qos, ServiceType, WireType};
 
 use super::Mirror;
 use super::outputs::NOWHERE;
@@ -17,7 +17,7 @@ pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
     let Some(mut changes) = original().map(|original| original.registrations()) else {
         return;
     };
-    while changes.changed().await.is_ok() {
+    while changes.next().await {
         let Some(original) = original() else { return };
         let registered = original.registered().await;
         let Some(mirror) = mirror.upgrade() else {
@@ -39,23 +39,24 @@ impl Mirror {
         }
         applied.stood_in = true;
         let types = registered.outputs.iter().chain(&registered.inputs);
-        for (_, wire_type) in types {
+        for (_, wire_type, _) in types.filter(|(_, of, _)| !of.definition.is_empty()) {
             let key = (wire_type.name.clone(), wire_type.digest.to_string());
             self.types.lock().insert(key, wire_type.clone());
         }
-        let output = |(topic, of): (String, WireType)| Output {
+        let told = |qos: Option<Qos>| qos.as_ref().map(control::Qos::of);
+        let output = |(topic, of, qos): (String, WireType, Option<Qos>)| Output {
             channel: NOWHERE,
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
-            qos: None,
+            qos: told(qos),
         };
-        let input = |(topic, of): (String, WireType)| Wanted {
+        let input = |(topic, of, qos): (String, WireType, Option<Qos>)| Wanted {
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
             feed: true,
-            qos: None,
+            qos: told(qos),
         };
         let serves = |(name, of): (String, ServiceType)| Served::of(NOWHERE, &name, &of);
         let graph = Graph {

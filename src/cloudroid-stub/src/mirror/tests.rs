@@ -1,23 +1,23 @@
 //! A robot's ROS, a servant's, and the two ends of a link between them: a mirror and a hub. Nodes are real ones of this
 //! process, but for the local original.
 
-use std::net::SocketAddr;
+mod ros2;
+
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::SessionOptions;
-use link::control::{Exit, Hello, Node, Output, Welcome};
+use link::control::{self, Exit, Hello, Node, Output, Welcome};
 use link::record::Data;
 use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD};
 use qos::{Side, Sla};
 use reach::links::{Hub, HubOptions, Nodes};
-use ros::bus::{Graph as Seen, Publisher, Qos, ServiceHandler, ServiceType, Subscription};
-use ros::net::HostSockets;
-use ros::ros1::Ros1Bus;
-use ros::ros1::master::{Master, MasterOptions};
+use ros::bus::{
+    Graph as Seen, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
+};
 use ros::schema::Registry;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
@@ -25,14 +25,28 @@ use ws::WebSocket;
 
 use super::diagnostics::Diagnostics;
 use super::*;
-use crate::local::tests::{SOON, setting, string, string_type, text};
+use crate::local::tests::setting;
+use crate::testing::{SOON, World, read, stories, string, string_type, text, written};
+
+stories! {
+    of_ros_1 = One:
+        who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before,
+        the_node_is_connected_before_the_first_message_comes,
+        newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
+        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back;
+    of_ros_2 = Two:
+        who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before,
+        the_node_is_connected_before_the_first_message_comes,
+        newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
+        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back;
+}
 
 /// Nodes that run whatever happens.
 struct Still;
 
 #[async_trait]
 impl Nodes for Still {
-    async fn start(&self, _: &Node) -> Result<(), String> {
+    async fn start(&self, _: &Node, _: &str) -> Result<(), String> {
         Ok(())
     }
     async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
@@ -56,29 +70,17 @@ impl Nodes for Still {
     }
 }
 
-async fn master() -> SocketAddr {
-    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let address = listener.local_addr().unwrap();
-    let master = Master::new(MasterOptions::default());
-    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
-    address
+async fn says(node: &Arc<dyn Bus>, topic: &str, latch: bool) -> Box<dyn Publisher> {
+    let of = string_type(node.version());
+    let qos = Qos::keep_last(100).latching(latch);
+    node.advertise(topic, of, qos).await.unwrap()
 }
 
-async fn node(at: SocketAddr, name: &str) -> Arc<Ros1Bus> {
-    let joined = Ros1Bus::connect(Arc::new(HostSockets), at, name);
-    joined.await.unwrap()
-}
-
-async fn says(node: &Ros1Bus, topic: &str, latch: bool) -> Box<dyn Publisher> {
-    node.advertise(topic, string_type(), Qos::keep_last(100).latching(latch))
-        .await
-        .unwrap()
-}
-
-async fn hears(node: &Ros1Bus, topic: &str) -> Subscription {
-    node.subscribe(topic, string_type(), Qos::keep_last(100))
-        .await
-        .unwrap()
+/// Hears what was said before, too.
+async fn hears(node: &Arc<dyn Bus>, topic: &str) -> Subscription {
+    let of = string_type(node.version());
+    let qos = Qos::keep_last(100).latching(true);
+    node.subscribe(topic, of, qos).await.unwrap()
 }
 
 async fn next(subscription: &mut Subscription) -> String {
@@ -86,7 +88,7 @@ async fn next(subscription: &mut Subscription) -> String {
     text(&next.expect("a message should come").unwrap())
 }
 
-async fn until(node: &Ros1Bus, what: &str, wanted: impl Fn(&Seen) -> bool) {
+async fn until(node: &Arc<dyn Bus>, what: &str, wanted: impl Fn(&Seen) -> bool) {
     let mut graph = node.graph();
     let seen = timeout(SOON, graph.wait_for(|graph| wanted(graph)))
         .await
@@ -94,25 +96,22 @@ async fn until(node: &Ros1Bus, what: &str, wanted: impl Fn(&Seen) -> bool) {
     assert!(seen, "{what}: {:#?}", node.graph().borrow());
 }
 
-fn bytes(text: &str) -> Bytes {
-    string(text).bytes
-}
-
 /// A robot with a mirror of this node, and its servant, where that node is of this process.
 struct Scene {
-    robot: SocketAddr,
+    ros: RosVersion,
+    robot: World,
     mirror: Arc<Mirror>,
     name: &'static str,
-    servant: SocketAddr,
+    servant: World,
     hub: Arc<Hub>,
-    real: Arc<Ros1Bus>,
+    real: Arc<dyn Bus>,
 }
 
 impl Scene {
-    async fn new(name: &'static str) -> Self {
-        let (robot, servant) = (master().await, master().await);
-        let bridge = node(servant, "/bridge").await;
-        let (registry, options) = (Arc::new(Registry::new()), HubOptions::default());
+    async fn new(ros: RosVersion, name: &'static str) -> Self {
+        let (robot, servant) = (World::new(ros).await, World::new(ros).await);
+        let bridge = servant.node("/bridge").await;
+        let (registry, options) = (Arc::new(Registry::of(ros)), HubOptions::default());
         let session = SessionOptions {
             ping: Duration::from_secs(1),
             silent: Duration::from_secs(10),
@@ -120,14 +119,20 @@ impl Scene {
             max_age: None,
         };
         let session = Arc::new(RobotSession::new(session));
+        let node = robot.node(name).await;
         Self {
-            robot,
-            mirror: Mirror::start(node(robot, name).await, "label".to_owned(), session, SOON),
+            ros,
+            mirror: Mirror::start(node, "label".to_owned(), session, SOON),
             name,
-            servant,
             hub: Hub::new("s", bridge, registry, Arc::new(Still), options),
-            real: node(servant, name).await,
+            real: servant.node(name).await,
+            robot,
+            servant,
         }
+    }
+
+    fn bytes(&self, text: &str) -> Bytes {
+        written(self.ros, text)
     }
 
     /// The link, until its task is aborted.
@@ -139,6 +144,7 @@ impl Scene {
         let (_, _, next) = self.mirror.session().position();
         let hello = Hello {
             run: "run".to_owned(),
+            ros: self.ros.number(),
             next,
             node: Node {
                 name: self.name.to_owned(),
@@ -171,24 +177,23 @@ fn is_published(graph: &Seen, topic: &str) -> bool {
     ends.is_some_and(|ends| !ends.publishers.is_empty())
 }
 
-#[tokio::test]
-async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before() {
-    let scene = Scene::new("/node").await;
+async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before(ros: RosVersion) {
+    let scene = Scene::new(ros, "/node").await;
     let mut heard = hears(&scene.real, "/map").await;
     let _link = scene.links().await;
-    let newcomer = node(scene.servant, "/newcomer").await;
+    let newcomer = scene.servant.node("/newcomer").await;
     // One that latches, one that does not, and one that ends without taking anything back.
     for (name, latch, ends_well) in [
         ("/map_server", true, true),
         ("/mapper", false, true),
         ("/crashed", true, false),
     ] {
-        let publisher = node(scene.robot, name).await;
+        let publisher = scene.robot.node(name).await;
         let map = says(&publisher, "/map", latch).await;
         let mut count = map.matched();
         count.wait_for(|now| now.connected() > 0).await.unwrap();
         for number in 0..20 {
-            map.publish(bytes(&format!("{name} {number}")));
+            map.publish(scene.bytes(&format!("{name} {number}")));
         }
         // All that it has said, though it leaves at once.
         if ends_well {
@@ -206,23 +211,22 @@ async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before() {
         until(&newcomer, name, |graph| !is_published(graph, "/map")).await;
     }
     // Who comes now is given what is latched by those who are there, and nothing of the others.
-    let publisher = node(scene.robot, "/new_map_server").await;
+    let publisher = scene.robot.node("/new_map_server").await;
     let map = says(&publisher, "/map", true).await;
-    map.publish(bytes("new"));
+    map.publish(scene.bytes("new"));
     assert_eq!(next(&mut heard).await, "new");
     let mut late = hears(&newcomer, "/map").await;
     assert_eq!(next(&mut late).await, "new");
-    map.publish(bytes("newer"));
+    map.publish(scene.bytes("newer"));
     assert_eq!(next(&mut late).await, "newer");
     let known = scene.mirror.inputs.known();
     assert_eq!(known, (1, 1), "channels and latched messages");
 }
 
-#[tokio::test]
-async fn the_node_is_connected_before_the_first_message_comes() {
-    let scene = Scene::new("/node").await;
+async fn the_node_is_connected_before_the_first_message_comes(ros: RosVersion) {
+    let scene = Scene::new(ros, "/node").await;
     let mut heard = hears(&scene.real, "/scan").await;
-    let robot = node(scene.robot, "/laser").await;
+    let robot = scene.robot.node("/laser").await;
     // One is there before the link is, the other comes later; neither has said anything.
     let early = says(&robot, "/scan", false).await;
     let _link = scene.links().await;
@@ -234,7 +238,7 @@ async fn the_node_is_connected_before_the_first_message_comes() {
         is_published(graph, "/camera")
     })
     .await;
-    early.publish(bytes("first"));
+    early.publish(scene.bytes("first"));
     assert_eq!(next(&mut heard).await, "first");
     assert_eq!(scene.mirror.inputs.known(), (2, 0));
     // Who leaves without a word leaves the cloud, too.
@@ -245,21 +249,21 @@ async fn the_node_is_connected_before_the_first_message_comes() {
     .await;
 }
 
-#[tokio::test]
-async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
-    let scene = Scene::new("/node").await;
+async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node(ros: RosVersion) {
+    let scene = Scene::new(ros, "/node").await;
     let output = Output {
         channel: 1,
         topic: "/map".to_owned(),
-        type_name: string_type().name,
-        md5: string_type().digest.to_string(),
-        ..Output::default()
+        type_name: string_type(ros).name,
+        md5: string_type(ros).digest.to_string(),
+        // In ROS 1 nobody says it beforehand.
+        qos: (ros == RosVersion::Two).then(|| control::Qos::of(&Qos::keep_last(1).latching(true))),
     };
     let key = (output.type_name.clone(), output.md5.clone());
-    scene.mirror.types.lock().insert(key, string_type());
+    scene.mirror.types.lock().insert(key, string_type(ros));
     let outputs = &scene.mirror.outputs;
     outputs.apply(&scene.mirror, &[output], false).await;
-    let app = node(scene.robot, "/app").await;
+    let app = scene.robot.node("/app").await;
     let mut map = hears(&app, "/map").await;
     map.matched
         .wait_for(|now| now.connected() > 0)
@@ -273,14 +277,14 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
         left: 0,
         serialise: 0,
         answered: None,
-        message: bytes("the cloud's"),
+        message: scene.bytes("the cloud's"),
     };
     let local = ros::bus::Message {
         latching: true,
-        ..string("the original's")
+        ..string(ros, "the original's")
     };
     let newcomer = async |name: &str| {
-        let newcomer = node(scene.robot, name).await;
+        let newcomer = scene.robot.node(name).await;
         next(&mut hears(&newcomer, "/map").await).await
     };
     outputs.take(&scene.mirror, cloud, 0);
@@ -304,27 +308,27 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node() {
 }
 
 /// Answers with these words.
-struct Says(&'static str);
+struct Says(Bytes);
 
 #[async_trait]
 impl ServiceHandler for Says {
     async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
-        Ok(self.0.into())
+        Ok(self.0.clone())
     }
 }
 
-#[tokio::test]
-async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back() {
-    let scene = Scene::new("/ns/relay").await;
-    let watcher: Arc<dyn Bus> = node(scene.robot, "/ns/relay_cloudroid").await;
+async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back(ros: RosVersion) {
+    let scene = Scene::new(ros, "/ns/relay").await;
+    let watcher: Arc<dyn Bus> = scene.robot.node("/ns/relay_cloudroid").await;
     let diagnostics = Diagnostics::new(&watcher, "/ns/relay", "robot").await;
     let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
     let sla = Sla::parse(sla).unwrap();
+    let relay = setting(&scene.robot, &["patient"]);
     let promised = scene
         .mirror
-        .promise(sla, setting(&["patient"]), diagnostics.unwrap(), &watcher);
+        .promise(sla, relay, diagnostics.unwrap(), &watcher);
     promised.await.unwrap();
-    let app = node(scene.robot, "/app").await;
+    let app = scene.robot.node("/app").await;
     let (input, mut out) = (
         says(&app, "/ns/in", false).await,
         hears(&app, "/absolute/out").await,
@@ -334,19 +338,22 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
         graph.services.contains_key(echo)
     })
     .await;
-    let echoed = app.call(echo, "hello".into(), SOON).await.unwrap();
-    assert_eq!(echoed, "hello", "the original's own answer");
+    let echoed = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
+    assert_eq!(read(ros, &echoed), "hello", "the original's own answer");
     let mut count = input.matched();
     count.wait_for(|now| now.connected() > 0).await.unwrap();
     out.matched
         .wait_for(|now| now.connected() > 0)
         .await
         .unwrap();
-    input.publish(bytes("scan"));
-    assert_eq!(next(&mut out).await, "scan");
+    input.publish(scene.bytes("scan"));
+    assert!(next(&mut out).await.ends_with("scan"));
     // The cloud is reached for the first time.
     let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
-    let _serving = scene.real.serve(echo, of, Arc::new(Says("cloud"))).await;
+    let serving = scene
+        .real
+        .serve(echo, of, Arc::new(Says(scene.bytes("cloud"))));
+    let _serving = serving.await.unwrap();
     let _link = scene.links().await;
     let deadline = tokio::time::Instant::now() + SOON;
     let keeper = scene.mirror.keeper().unwrap();
@@ -357,6 +364,6 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
         );
         tokio::task::yield_now().await;
     }
-    let answer = app.call(echo, "hello".into(), SOON).await.unwrap();
-    assert_eq!(answer, "cloud");
+    let answer = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
+    assert_eq!(read(ros, &answer), "cloud");
 }

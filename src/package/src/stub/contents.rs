@@ -22,6 +22,8 @@ pub struct Contents {
     pub executables: BTreeSet<String>,
     /// Everything below `share/PACKAGE`, by path from there.
     pub share: BTreeMap<String, Content>,
+    /// Classes of nodes for component containers (ROS 2).
+    pub components: BTreeSet<String>,
 }
 
 /// A file, or a link that stays within the package.
@@ -53,6 +55,7 @@ impl Contents {
         Ok(Self {
             executables: package.executables.clone(),
             share,
+            components: package.components.keys().cloned().collect(),
         })
     }
 }

@@ -1,10 +1,10 @@
 //! `stub.toml`, which the robot's owner may change, and `revision.toml`, which says what the archive was made of.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::About;
+use super::{About, Words};
 
 /// The robot's settings, with what may be added.
 pub(super) fn stub(about: &About<'_>) -> String {
@@ -23,11 +23,12 @@ pub(super) fn stub(about: &About<'_>) -> String {
         stateful: about.stateful,
     };
     let known = toml::to_string(&known).expect("texts and a word are TOML");
+    let words = Words::of(about.ros);
     format!(
         "# How this robot uses the service {}. Each key can also be given by the environment (CLOUDROID_MAX=0.3) or by\n\
-         # a parameter of the node or of a namespace around it (~cloudroid/max). `rosrun {} cloudroid-stub doctor` checks it.\n\
+         # {}. `{} {} cloudroid-stub doctor` checks it.\n\
          {known}{SETTINGS}",
-        about.service, about.package
+        about.service, words.settings, words.run, about.package
     )
 }
 
@@ -38,6 +39,7 @@ const SETTINGS: &str = include_str!("inside/settings.toml");
 pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> String {
     #[derive(Serialize)]
     struct Revision<'a> {
+        ros: u8,
         package: &'a str,
         service: &'a str,
         revision: u64,
@@ -45,6 +47,8 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         architecture: &'a str,
         outsourced: &'a BTreeSet<String>,
         original: BTreeSet<&'a String>,
+        #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+        names: &'a BTreeMap<String, String>,
         #[serde(skip_serializing_if = "Option::is_none")]
         defaults: Option<Defaults>,
     }
@@ -55,6 +59,7 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         max: f64,
     }
     let revision = Revision {
+        ros: about.ros.number(),
         package: about.package,
         service: about.service,
         revision: about.revision,
@@ -62,6 +67,7 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         architecture: about.architecture,
         outsourced: about.outsourced,
         original: executables.difference(about.outsourced).collect(),
+        names: about.names,
         defaults: about.times.map(|(desire, max)| Defaults { desire, max }),
     };
     let text = toml::to_string(&revision).expect("texts and a number are TOML");

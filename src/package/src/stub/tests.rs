@@ -1,3 +1,5 @@
+mod ament;
+
 use super::*;
 use crate::interface::{Direction, Topic};
 
@@ -40,6 +42,7 @@ fn contents() -> Contents {
         share: share
             .map(|(path, content)| (path.to_owned(), content))
             .into(),
+        components: BTreeSet::new(),
     }
 }
 
@@ -48,6 +51,10 @@ fn composed(outsourced: &[&str]) -> Files {
 }
 
 fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
+    composed_for(RosVersion::One, outsourced, contents)
+}
+
+fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
     let outsourced = outsourced.iter().map(|name| (*name).to_owned()).collect();
     let mut interface = Interface {
         topics: vec![Topic {
@@ -58,6 +65,7 @@ fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
             nodes: vec![],
             latched: false,
             lazy: true,
+            qos: None,
         }],
         ..Interface::default()
     };
@@ -65,6 +73,7 @@ fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
         interface.definitions.insert(key.into(), "int32 x\n".into());
     }
     let about = About {
+        ros,
         service: "serves",
         package: "p",
         revision: 3,
@@ -75,6 +84,7 @@ fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
         },
         architecture: "x86_64",
         outsourced: &outsourced,
+        names: &[("node".to_owned(), "names_itself".to_owned())].into(),
         interface: &interface,
         stateful: true,
         times: Some((0.1, 0.3)),
@@ -158,6 +168,7 @@ fn settings_and_origin_are_told_in_toml() {
     assert_eq!(revision["revision"].as_integer(), Some(3));
     assert_eq!(revision["outsourced"][0].as_str(), Some("node"));
     assert_eq!(revision["original"][0].as_str(), Some("helper_node"));
+    assert_eq!(revision["names"]["node"].as_str(), Some("names_itself"));
     let defaults = &revision["defaults"];
     assert_eq!(
         (defaults["desire"].as_float(), defaults["max"].as_float()),
@@ -206,6 +217,7 @@ fn nodelets_name_a_library_that_says_why() {
 fn without_a_manifest_there_is_no_stub() {
     let interface = Interface::default();
     let about = About {
+        ros: RosVersion::One,
         service: "p",
         package: "p",
         revision: 1,
@@ -213,6 +225,7 @@ fn without_a_manifest_there_is_no_stub() {
         portal: &Portal::default(),
         architecture: "x86_64",
         outsourced: &BTreeSet::new(),
+        names: &BTreeMap::new(),
         interface: &interface,
         stateful: true,
         times: None,
@@ -237,7 +250,6 @@ fn unpacked_of(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir {
 
 /// Writes what an archive is unpacked to.
 fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) {
-    use std::os::unix::fs::{PermissionsExt, symlink};
     let mut files = files.clone();
     files.insert(format!("lib/p/{PROGRAM}"), file(PROGRAM_OF_TESTS, true));
     let signer = format!("{}\n", key.public().signer());
@@ -247,7 +259,12 @@ fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) 
     let signature = key.sign("cloudroid-stub", &digest);
     files.insert(SIGNATURE.into(), file(&signature, false));
     files.insert(MANIFEST.into(), file(&list, false));
-    for (path, content) in &files {
+    write(&files, place);
+}
+
+fn write(files: &Files, place: &std::path::Path) {
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    for (path, content) in files {
         let path = place.join(path);
         std::fs::create_dir_all(path.parent().expect("below")).expect("made");
         match content {

@@ -16,6 +16,7 @@
 set -eu
 
 package='@PACKAGE@'
+ros=@ROS@
 case $0 in */*) here=${0%/*} ;; *) here=. ;; esac
 here=$(cd "$here" && pwd)
 
@@ -30,7 +31,7 @@ usage() {
 
 uninstall=false force=false prefix='' line='' key='' server='' ca='' fingerprint='' token='' robot=''
 # Installed, it stands in the overlay's share/PKG; in the archive, at its top.
-if [ ! -e "$here/.catkin" ]; then
+if [ ! -d "$here/share/$package" ]; then
   prefix=$(cd "$here/../.." && pwd)
 fi
 while [ $# -gt 0 ]; do
@@ -64,18 +65,46 @@ case $prefix in *[:\'\"\\]*) complain "$prefix: a directory on a search path can
 share=$prefix/share/$package
 lib=$prefix/lib/$package
 
+index=$prefix/share/ament_index
+# What stands at the top of the overlay, beside its packages.
+case $ros in
+  1) setups='setup.sh' copied='setup.bash setup.zsh .catkin' ;;
+  2) setups='setup.sh local_setup.sh' copied='setup.bash setup.zsh local_setup.bash local_setup.zsh' ;;
+esac
+
+# What ament's index says of this package, and what leads to its original.
+unregister() {
+  rm -f "$index/resource_index"/*/"$package" "$prefix/lib/lib${package}__rosidl_"*
+}
+
+# Generic subscriptions of rclcpp (rosbag2, bridges) look for the code of message types below the install space of their package, which
+# this overlay is now: links lead to the original's.
+link_types() {
+  [ -e "$index/resource_index/rosidl_interfaces/$package" ] || return 0
+  left=${AMENT_PREFIX_PATH:-}:
+  while [ -n "$left" ]; do
+    item=${left%%:*} left=${left#*:}
+    if [ -z "$item" ] || [ "$item" = "$prefix" ]; then continue; fi
+    for library in "$item/lib/lib${package}__rosidl_"*.so; do
+      if [ -e "$library" ]; then ln -sf "$library" "$prefix/lib/"; left=''; fi
+    done
+  done
+}
+
 # rospack remembers for a minute where packages are.
 refresh() {
-  if command -v rospack > /dev/null; then rospack profile > /dev/null 2>&1 || true; fi
+  if [ $ros = 1 ] && command -v rospack > /dev/null; then rospack profile > /dev/null 2>&1 || true; fi
 }
 
 if $uninstall; then
   [ -e "$share/revision.toml" ] || complain "no stub of $package is installed in $prefix"
   rm -rf "$lib" "$share"
+  unregister
   # The overlay itself goes with its last stub.
   if rmdir "$prefix/lib" 2> /dev/null; then
+    rm -rf "$index"
     rmdir "$prefix/share" 2> /dev/null || true
-    rm -f "$prefix/.catkin" "$prefix/setup.sh" "$prefix/setup.bash" "$prefix/setup.zsh" "$prefix/servers.pub"
+    for file in $setups $copied servers.pub; do rm -f "$prefix/$file"; done
     rmdir "$prefix" 2> /dev/null || true
   fi
   refresh
@@ -83,10 +112,13 @@ if $uninstall; then
   exit 0
 fi
 
-[ -e "$here/.catkin" ] || complain "this copy can only --uninstall; install from the unpacked archive"
+[ -d "$here/share/$package" ] || complain "this copy can only --uninstall; install from the unpacked archive"
 if [ -e "$share" ] && [ ! -e "$share/revision.toml" ]; then
   complain "$share is there and is no stub: choose another --prefix"
 fi
+# One set-up file puts one ROS's stubs in front.
+case $ros in 1) others=2 mark=$index ;; 2) others=1 mark=$prefix/.catkin ;; esac
+[ ! -e "$mark" ] || complain "$prefix holds stubs of ROS $others, and this one is of ROS $ros: choose another --prefix"
 # KEY of the line; cloudroid-stub pair looks at all of it.
 of_line() {
   printf '%s\n' "$line" | sed -n "s/^cloudroid:.*[?&]$1=\([A-Za-z0-9_.:-]*\).*/\1/p"
@@ -122,7 +154,7 @@ case $key in
 esac > "$signers"
 [ -s "$signers" ] || complain "$key holds no key (ssh-ed25519 AAAA...)"
 
-# Verifies the list's signature: by OpenSSH 8.1 or later, else by Python, which every robot with roslaunch has.
+# Verifies the list's signature: by OpenSSH 8.1 or later, else by Python, which every robot with launch files has.
 verify() {
   if ssh-keygen -Y verify -f "$signers" -I cloudroid -n cloudroid-stub -s "$here/MANIFEST.sig" < "$here/MANIFEST" > /dev/null 2> "$work/said"; then
     return 0
@@ -330,6 +362,13 @@ rm -rf "$lib" "$share.old"
 if [ -e "$share" ]; then mv "$share" "$share.old"; fi
 cp -R "$here/lib/$package" "$lib"
 cp -R "$here/share/$package" "$share"
+unregister
+if [ $ros = 2 ]; then
+  cp -R "$here/share/ament_index" "$prefix/share/"
+  find "$index" -type d -exec chmod 0755 {} +
+  find "$index" -type f -exec chmod 0644 {} +
+  link_types
+fi
 cp "$here/install.sh" "$share/install.sh"
 cp "$here/server.pub" "$share/server.pub"
 cat "$settings" > "$share/stub.toml"
@@ -348,10 +387,12 @@ if [ -n "$ca" ]; then cat "$ca" > "$share/ca.pem"; fi
 rm -rf "$share.old"
 # Further ones may be known already: several servers' stubs share an overlay.
 if ! grep -qxF "$(cat "$here/server.pub")" "$prefix/servers.pub" 2> /dev/null; then cat "$here/server.pub" >> "$prefix/servers.pub"; fi
-for file in setup.bash setup.zsh .catkin; do cp "$here/$file" "$prefix/$file"; done
+for file in $copied; do cp "$here/$file" "$prefix/$file"; done
 replacement=$(printf '%s\n' "$prefix" | sed 's/[&|]/\\&/g')
-sed "s|^_cloudroid_installed=.*|_cloudroid_installed='$replacement'|" "$here/setup.sh" > "$prefix/setup.sh.new"
-mv "$prefix/setup.sh.new" "$prefix/setup.sh"
+for file in $setups; do
+  sed "s|^_cloudroid_installed=.*|_cloudroid_installed='$replacement'|" "$here/$file" > "$prefix/$file.new"
+  mv "$prefix/$file.new" "$prefix/$file"
+done
 refresh
 
 case ${SHELL:-} in */zsh) setup=setup.zsh ;; */bash) setup=setup.bash ;; *) setup=setup.sh ;; esac
@@ -360,6 +401,6 @@ Installed in $prefix. Source it after every other setup file, in each shell or a
 
     . $prefix/$setup
 
-To look whether all is well:  rosrun $package cloudroid-stub doctor
+To look whether all is well:  @RUN@ $package cloudroid-stub doctor
 To undo this:                 sh $share/install.sh --uninstall
 END

@@ -1,0 +1,287 @@
+//! ROS 2: the overlay on AMENT_PREFIX_PATH, and whether the stub and the robot's nodes can hear each other.
+
+use std::path::{Path, PathBuf};
+
+use ros::Interfaces;
+
+use super::super::Check;
+use super::{ExaminedStub, found, is, shadowed};
+use crate::network::{self, Variable};
+
+const INDEX: &str = "share/ament_index/resource_index";
+/// Implementations of ROS 2's middleware that speak RTPS and were tried with stubs.
+const TRIED: [&str; 3] = [
+    "rmw_fastrtps_cpp",
+    "rmw_fastrtps_dynamic_cpp",
+    "rmw_cyclonedds_cpp",
+];
+
+/// All of these.
+pub async fn checks(stub: &ExaminedStub, variable: Variable<'_>) -> Vec<Check> {
+    let prefixes = prefixes(variable);
+    let mut checks = vec![
+        shadowing(stub, &prefixes),
+        middleware(variable),
+        domain(variable).await,
+    ];
+    checks.extend(security(variable));
+    checks.extend(messages(stub, &prefixes));
+    checks
+}
+
+fn prefixes(variable: Variable<'_>) -> Vec<PathBuf> {
+    let value = variable("AMENT_PREFIX_PATH").unwrap_or_default();
+    std::env::split_paths(&value).collect()
+}
+
+/// Tools take the first install space in whose index the package is.
+fn shadowing(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Check {
+    let entry = Path::new(INDEX).join("packages").join(&stub.package);
+    let first = prefixes.iter().find(|prefix| prefix.join(&entry).is_file());
+    match first {
+        Some(first) if is(first, &stub.overlay()) => found(stub),
+        first => shadowed("AMENT_PREFIX_PATH", first, stub),
+    }
+}
+
+fn middleware(variable: Variable<'_>) -> Check {
+    const NAME: &str = "RMW_IMPLEMENTATION";
+    let chosen = variable(NAME).filter(|value| !value.is_empty());
+    match chosen.as_deref() {
+        None => Check::good(
+            "middleware",
+            format!("{NAME} is not set: the distribution's own"),
+        ),
+        Some(tried) if TRIED.contains(&tried) => Check::good("middleware", tried),
+        Some(zenoh) if zenoh.starts_with("rmw_zenoh") => Check::bad(
+            "middleware",
+            format!(
+                "{zenoh} does not speak DDS, and stubs speak nothing else so far: this robot's nodes and the stub do not hear each other"
+            ),
+            format!(
+                "export {NAME}=rmw_fastrtps_cpp (or rmw_cyclonedds_cpp), for all nodes of this robot"
+            ),
+        ),
+        Some(other) => Check::warning(
+            "middleware",
+            format!(
+                "{other} was not tried with stubs; it works where it speaks RTPS as OMG specifies it"
+            ),
+            format!("if nodes do not hear each other: export {NAME}=rmw_fastrtps_cpp"),
+        ),
+    }
+}
+
+async fn domain(variable: Variable<'_>) -> Check {
+    match network::network(variable).await {
+        Ok((id, network)) => {
+            let place = match network.interfaces {
+                _ if network.alone => "where nobody is looked for",
+                Interfaces::All => "on all networks of this robot",
+                _ => "on this machine alone",
+            };
+            Check::good("domain", format!("{id}, {place}"))
+        }
+        Err(error) => Check::bad(
+            "domain",
+            format!("{error:#}"),
+            "set the variable as the robot's other nodes have it, or unset it",
+        ),
+    }
+}
+
+/// Nodes that encrypt what they say hear none that does not.
+fn security(variable: Variable<'_>) -> Option<Check> {
+    const NAME: &str = "ROS_SECURITY_ENABLE";
+    let enabled = variable(NAME).is_some_and(|value| value == "true");
+    enabled.then(|| {
+        Check::bad(
+            "security",
+            format!("{NAME} is true: this robot's nodes encrypt (SROS 2), which stubs do not, so they do not hear each other"),
+            format!("unset {NAME} for the nodes that use this service"),
+        )
+    })
+}
+
+/// Generic subscriptions (rosbag2, bridges) look for the code of a package's messages below the install space of the package.
+fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
+    let overlay = stub.overlay();
+    let entry = overlay.join(INDEX).join("rosidl_interfaces");
+    let library = format!("lib/lib{}__rosidl_typesupport_cpp.so", stub.package);
+    if !entry.join(&stub.package).is_file() || overlay.join(&library).exists() {
+        return None;
+    }
+    let original = prefixes
+        .iter()
+        .find(|prefix| prefix.join(&library).exists())?;
+    Some(Check::warning(
+        "messages",
+        format!(
+            "rosbag2 and bridges do not find the code of {}'s messages, which is in {}",
+            stub.package,
+            original.display()
+        ),
+        format!(
+            "{} again, from a shell with ROS 2 sourced",
+            stub.installer()
+        ),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::Verdict;
+    use super::*;
+
+    struct Robot(tempfile::TempDir);
+
+    impl Robot {
+        fn new() -> Robot {
+            let robot = Robot(tempfile::tempdir().expect("a directory"));
+            for prefix in ["ros", "stub"] {
+                robot.file(prefix, &format!("{INDEX}/packages/p"));
+                robot.file(prefix, "share/p/package.xml");
+            }
+            robot
+        }
+
+        fn path(&self, name: &str) -> PathBuf {
+            self.0.path().canonicalize().expect("there").join(name)
+        }
+
+        fn file(&self, prefix: &str, path: &str) {
+            let path = self.path(prefix).join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, "").expect("written");
+        }
+
+        /// With AMENT_PREFIX_PATH of these, and other variables.
+        async fn examined(&self, prefixes: &str, others: &[(&str, &str)]) -> Vec<Check> {
+            let stub = ExaminedStub {
+                share: self.path("stub/share/p"),
+                package: "p".into(),
+            };
+            let prefixes = prefixes.split(':').map(|prefix| self.path(prefix));
+            let prefixes = std::env::join_paths(prefixes).expect("no colons");
+            let prefixes = prefixes.into_string().expect("UTF-8");
+            checks(&stub, &|name: &str| {
+                let other = others.iter().find(|(variable, _)| *variable == name);
+                match other {
+                    Some((_, value)) => Some((*value).to_owned()),
+                    None => (name == "AMENT_PREFIX_PATH").then(|| prefixes.clone()),
+                }
+            })
+            .await
+        }
+    }
+
+    fn named<'a>(checks: &'a [Check], name: &str) -> Option<&'a Check> {
+        checks.iter().find(|check| check.name == name)
+    }
+
+    #[tokio::test]
+    async fn the_index_of_the_stub_must_come_first() {
+        let robot = Robot::new();
+        for prefixes in ["stub:ros", "other:stub:ros"] {
+            let checks = robot.examined(prefixes, &[]).await;
+            assert!(
+                checks.iter().all(|check| check.verdict == Verdict::Good),
+                "{checks:?}"
+            );
+        }
+        for (prefixes, said) in [
+            ("ros:stub", "ros before this stub"),
+            ("other", "AMENT_PREFIX_PATH does not name this stub"),
+        ] {
+            let checks = robot.examined(prefixes, &[]).await;
+            let check = named(&checks, "shadowing").expect("a check");
+            assert_eq!(check.verdict, Verdict::Bad);
+            assert!(check.found.contains(said), "{check:?}");
+            assert!(
+                check
+                    .fix
+                    .as_ref()
+                    .is_some_and(|fix| fix.contains("stub/setup.sh"))
+            );
+        }
+    }
+
+    #[tokio::test]
+    async fn what_keeps_nodes_from_hearing_each_other_is_said() {
+        let robot = Robot::new();
+        for (name, value, check, verdict, said) in [
+            (
+                "RMW_IMPLEMENTATION",
+                "rmw_cyclonedds_cpp",
+                "middleware",
+                Verdict::Good,
+                "cyclone",
+            ),
+            (
+                "RMW_IMPLEMENTATION",
+                "rmw_connextdds",
+                "middleware",
+                Verdict::Warning,
+                "not tried",
+            ),
+            (
+                "RMW_IMPLEMENTATION",
+                "rmw_zenoh_cpp",
+                "middleware",
+                Verdict::Bad,
+                "does not speak DDS",
+            ),
+            (
+                "ROS_DOMAIN_ID",
+                "7",
+                "domain",
+                Verdict::Good,
+                "7, on all networks",
+            ),
+            (
+                "ROS_LOCALHOST_ONLY",
+                "1",
+                "domain",
+                Verdict::Good,
+                "0, on this machine alone",
+            ),
+            (
+                "ROS_DOMAIN_ID",
+                "300",
+                "domain",
+                Verdict::Bad,
+                "ROS_DOMAIN_ID is \"300\"",
+            ),
+            (
+                "ROS_SECURITY_ENABLE",
+                "true",
+                "security",
+                Verdict::Bad,
+                "SROS 2",
+            ),
+        ] {
+            let checks = robot.examined("stub:ros", &[(name, value)]).await;
+            let found = named(&checks, check).expect("a check");
+            assert_eq!(found.verdict, verdict, "{found:?}");
+            assert!(found.found.contains(said), "{found:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn code_of_messages_is_missed_where_the_original_has_it() {
+        let robot = Robot::new();
+        robot.file("stub", &format!("{INDEX}/rosidl_interfaces/p"));
+        let examined = || robot.examined("stub:ros", &[]);
+        assert!(
+            named(&examined().await, "messages").is_none(),
+            "nobody has it"
+        );
+        robot.file("ros", "lib/libp__rosidl_typesupport_cpp.so");
+        let checks = examined().await;
+        let check = named(&checks, "messages").expect("a check");
+        assert_eq!(check.verdict, Verdict::Warning);
+        assert!(check.found.ends_with("ros"), "{check:?}");
+        robot.file("stub", "lib/libp__rosidl_typesupport_cpp.so");
+        assert!(named(&examined().await, "messages").is_none());
+    }
+}

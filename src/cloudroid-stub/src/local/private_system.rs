@@ -1,0 +1,234 @@
+//! The private ROS system of the local original, of the robot's ROS: a Master of the stub's own, or a domain of its own. Only this
+//! machine can reach it, and the stub's own node there is the only way in or out.
+
+use std::ffi::OsString;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use ros::bus::{Bus, Graph, Qos, RosVersion, ServiceType, WireType};
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::lender::Robot;
+use super::original::Interface;
+use super::private_domain::PrivateDomain;
+use super::private_master::PrivateMaster;
+use crate::seen;
+
+/// The stub's name in it.
+pub(super) const NODE: &str = "/cloudroid_stub";
+/// For a node whose process has ended to be gone from the graph.
+const GONE: Duration = Duration::from_secs(5);
+
+/// A topic of a node, with its quality of service where ends tell that (ROS 2).
+pub type RegisteredTopic = (String, WireType, Option<Qos>);
+
+/// What a node has registered.
+#[derive(Debug, Clone, Default)]
+pub struct Registered {
+    /// What it publishes.
+    pub outputs: Vec<RegisteredTopic>,
+    /// What it subscribes to.
+    pub inputs: Vec<RegisteredTopic>,
+    /// What it serves.
+    pub services: Vec<(String, ServiceType)>,
+}
+
+/// Variables of a process, each with its value, or none where it is to be unset.
+pub type Variables = Vec<(&'static str, Option<OsString>)>;
+
+/// A ROS system and a node in it; both end with it.
+pub struct PrivateSystem {
+    place: Place,
+    bus: Arc<dyn Bus>,
+}
+
+enum Place {
+    Master(PrivateMaster),
+    Domain(PrivateDomain),
+}
+
+/// Tells of changes of a graph.
+pub enum Changes {
+    /// Of a Master.
+    Generations(watch::Receiver<u64>),
+    /// Of a domain.
+    Graphs(watch::Receiver<Arc<Graph>>),
+}
+
+impl Changes {
+    /// Returns with the next change; false where there will be none.
+    pub async fn next(&mut self) -> bool {
+        let changed = match self {
+            Self::Generations(changes) => changes.changed().await,
+            Self::Graphs(changes) => changes.changed().await,
+        };
+        changed.is_ok()
+    }
+}
+
+impl PrivateSystem {
+    /// Makes one for a robot of this ROS.
+    pub async fn new(robot: &dyn Bus, taken: Option<u16>) -> anyhow::Result<Self> {
+        match robot.version() {
+            RosVersion::One => {
+                let (master, bus) = PrivateMaster::new().await?;
+                let place = Place::Master(master);
+                Ok(Self { place, bus })
+            }
+            RosVersion::Two => {
+                let (domain, bus) = PrivateDomain::new(taken).await?;
+                let place = Place::Domain(domain);
+                Ok(Self { place, bus })
+            }
+        }
+    }
+
+    /// The stub's node in it.
+    pub fn bus(&self) -> &Arc<dyn Bus> {
+        &self.bus
+    }
+
+    /// What a process is told by, so that its nodes are here.
+    pub fn environment(&self) -> Variables {
+        match &self.place {
+            Place::Master(master) => master.environment(),
+            Place::Domain(domain) => domain.environment(),
+        }
+    }
+
+    /// What `node` calls that is served elsewhere on the robot.
+    pub async fn lend(
+        &self,
+        node: &str,
+        robot: &Arc<dyn Bus>,
+        limit: Duration,
+    ) -> anyhow::Result<()> {
+        let lender = Arc::new(Robot::new(node, robot, limit));
+        let lent = async { self.bus.lending()?.lend(lender).await };
+        lent.await.context("lending services to the local original")
+    }
+
+    /// Takes over what nodes of the robot share, where its ROS has such a thing.
+    pub async fn copy_parameters(&self, from: &dyn Bus) -> anyhow::Result<()> {
+        match &self.place {
+            Place::Master(master) => master.copy_parameters(from).await,
+            Place::Domain(_) => Ok(()),
+        }
+    }
+
+    /// What is registered.
+    pub fn graph(&self) -> Arc<Graph> {
+        match &self.place {
+            Place::Master(master) => Arc::new(master.graph()),
+            Place::Domain(_) => Arc::clone(&self.bus.graph().borrow()),
+        }
+    }
+
+    /// Changes with whatever is registered.
+    pub fn changes(&self) -> Changes {
+        match &self.place {
+            Place::Master(master) => Changes::Generations(master.generation()),
+            Place::Domain(_) => Changes::Graphs(self.bus.graph()),
+        }
+    }
+
+    /// Returns once the graph is as it is wanted.
+    async fn until(&self, wanted: impl Fn(&Graph) -> bool) {
+        let mut changes = self.changes();
+        while !wanted(&self.graph()) {
+            if !changes.next().await {
+                std::future::pending::<()>().await;
+            }
+        }
+    }
+
+    /// Returns once a node of this name is registered.
+    pub async fn registered(&self, node: &str) {
+        self.until(|graph| seen::is_there(graph, node)).await;
+    }
+
+    /// Returns once `node` has registered all of this.
+    pub async fn registers(&self, node: &str, all: &Interface) {
+        self.until(|graph| {
+            let listens = |topic: &String| seen::subscribes(graph, node, topic);
+            let says = |topic: &String| seen::publishes(graph, node, topic);
+            let serves = |service: &String| seen::serves(graph, node, service);
+            all.inputs.keys().all(listens)
+                && all.outputs.iter().all(says)
+                && all.services.iter().all(serves)
+        })
+        .await;
+    }
+
+    /// What `node` has registered, as far as its types can be told.
+    pub async fn registered_by(&self, node: &str) -> Registered {
+        let graph = self.graph();
+        if self.bus.version() == RosVersion::Two {
+            return by_ends(&graph, node);
+        }
+        let mut registered = Registered::default();
+        for topic in graph.topics.keys() {
+            let says = seen::publishes(&graph, node, topic);
+            let listens = seen::subscribes(&graph, node, topic);
+            if !says && !listens {
+                continue;
+            }
+            let Ok(wire_type) = self.bus.topic_type(topic).await else {
+                continue;
+            };
+            if says && !wire_type.digest.is_any() {
+                let output = (topic.clone(), wire_type.clone(), None);
+                registered.outputs.push(output);
+            }
+            if listens {
+                registered.inputs.push((topic.clone(), wire_type, None));
+            }
+        }
+        for service in graph.services.keys() {
+            if !seen::serves(&graph, node, service) {
+                continue;
+            }
+            if let Ok(service_type) = self.bus.service_type(service).await {
+                registered.services.push((service.clone(), service_type));
+            }
+        }
+        registered
+    }
+
+    /// The process of `node` has ended: returns once its registrations are gone.
+    pub async fn process_exited(&self, node: &str) {
+        match &self.place {
+            Place::Master(master) => master.process_exited().await,
+            // Its ports are free, which is seen in a moment.
+            Place::Domain(_) => {
+                let gone = self.until(|graph| !seen::is_there(graph, node));
+                if timeout(GONE, gone).await.is_err() {
+                    tracing::warn!(node, "its process has ended, and its node is still there");
+                }
+            }
+        }
+    }
+}
+
+/// What the ends of a node of ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
+fn by_ends(graph: &Graph, node: &str) -> Registered {
+    let Some(ends) = graph.ends.get(node) else {
+        return Registered::default();
+    };
+    let topic =
+        |(topic, (of, qos)): (&String, &(WireType, Qos))| (topic.clone(), of.clone(), Some(*qos));
+    let inputs = ends.subscribers.iter();
+    let services = ends.services.iter();
+    Registered {
+        outputs: ends.publishers.iter().map(topic).collect(),
+        inputs: inputs
+            .filter(|(topic, _)| *topic != "/parameter_events")
+            .map(topic)
+            .collect(),
+        services: services
+            .map(|(service, of)| (service.clone(), of.clone()))
+            .collect(),
+    }
+}
