@@ -4,6 +4,7 @@
 use std::process::ExitCode;
 
 use libtest_mimic::{Arguments, Trial};
+use ros::bus::RosVersion;
 use support::Verdict;
 
 #[path = "stories/access.rs"]
@@ -102,6 +103,8 @@ mod recordings;
 mod refusals;
 #[path = "stories/rollouts.rs"]
 mod rollouts;
+#[path = "stories/ros2.rs"]
+mod ros2;
 #[path = "stories/shadowing.rs"]
 mod shadowing;
 #[path = "stories/sharing.rs"]
@@ -135,6 +138,23 @@ macro_rules! stories {
     ($module:ident: $($name:ident),+ $(,)?) => {
         vec![$(story(concat!(stringify!($module), "::", stringify!($name)), $module::$name)),+]
     };
+}
+
+/// The same, of a robot of each ROS.
+macro_rules! of_both {
+    ($module:ident: $($name:ident),+ $(,)?) => {
+        vec![$(
+            of(RosVersion::One, concat!(stringify!($module), "::", stringify!($name)), $module::$name),
+            of(RosVersion::Two, concat!(stringify!($module), "::ros2::", stringify!($name)), $module::$name),
+        )+]
+    };
+}
+
+/// A story that is told of a robot of this ROS.
+fn of(version: RosVersion, name: &str, tell: fn(RosVersion) -> Verdict) -> Trial {
+    Trial::test(name, move || {
+        tell(version).map_err(|error| format!("{error:#}").into())
+    })
 }
 
 fn main() -> ExitCode {
@@ -204,7 +224,7 @@ fn main() -> ExitCode {
             a_package_is_evaluated_native_against_outsourced,
             what_cannot_be_evaluated_is_said,
         ],
-        stories![failover:
+        of_both![failover:
             a_slow_network_costs_few_requests,
             a_lost_link_hands_over_and_back,
             frames_that_stay_away_stop_the_robot_and_wake_its_original,
@@ -212,7 +232,7 @@ fn main() -> ExitCode {
             a_first_sign_has_the_original_ready_before_it_is_needed,
             explain_says_why,
         ],
-        stories![fallback:
+        of_both![fallback:
             an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back,
             a_server_that_was_never_reached_is_stood_in_for_until_it_comes,
             a_promise_holds_without_a_server_too_until_it_comes,
@@ -233,10 +253,10 @@ fn main() -> ExitCode {
             a_second_daemon_on_the_same_home_is_refused,
             the_state_is_closed_to_others,
             a_taken_port_is_named,
-            the_demo_ends_by_itself_and_leaves_nothing,
             doctor_names_each_need,
             a_robot_that_stays_away_loses_its_servant_after_the_grace_time,
         ],
+        of_both![house: the_demo_ends_by_itself_and_leaves_nothing],
         stories![images:
             skopeo_and_umoci_read_the_store,
             an_exported_service_is_published_on_another_server,
@@ -313,6 +333,14 @@ fn main() -> ExitCode {
             one_message_right_after_connecting_is_not_lost,
             who_has_just_connected_hears_what_the_node_answers,
             the_robot_s_master_starts_again,
+        ],
+        stories![ros2:
+            a_workspace_is_pushed_and_asked_by_rosbridge,
+            a_herald_in_the_cloud_is_a_node_of_the_robot,
+            the_robot_s_graph_is_the_original_s,
+            an_application_of_rclpy_asks_the_cloud,
+            a_node_lives_on_when_the_daemon_starts_again,
+            a_robot_of_the_other_ros_is_refused_by_name,
         ],
         stories![memory:
             what_is_begun_and_never_ended_costs_its_owner,

@@ -123,7 +123,7 @@ impl Program {
             .args(words)
             .env("HOME", "/root")
             .env("ROS_IP", "127.0.0.1")
-            .env("ROS_MASTER_URI", format!("http://{}", site.master))
+            .env("ROS_MASTER_URI", format!("http://{}", site.master()?))
             .stdin(Stdio::null())
             .stdout(said.try_clone()?)
             .stderr(said)

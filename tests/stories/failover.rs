@@ -6,14 +6,14 @@ use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
-use ros::bus::Subscription;
+use ros::bus::{RosVersion, Subscription};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
-use support::people::{self, Camera, picture};
+use support::people::{self, Camera, picture_of};
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
-use support::world::{PEOPLE, world};
+use support::world::world;
 
 /// Generous: these machines are slow, and the network is worse yet.
 const T_MAX: f64 = 5.0;
@@ -41,21 +41,24 @@ struct Scene {
 
 impl Scene {
     /// With these lines in `stub.toml`.
-    fn new(robot: &str, more: &str) -> anyhow::Result<Self> {
-        let daemon = world().with(PEOPLE)?;
-        Self::before(daemon, robot, |site, daemon, cable| {
-            people::stub(site, daemon, cable, (PEOPLE.name, robot), more, &[])
+    fn new(ros: RosVersion, robot: &str, more: &str) -> anyhow::Result<Self> {
+        let service = people::service(ros);
+        let daemon = world().with(service)?;
+        let robot = named(robot, ros);
+        Self::before(ros, daemon, &robot, |site, daemon, cable| {
+            people::stub(site, daemon, cable, (service.name, &robot), more, &[])
         })
     }
 
     /// With a stub that is started so.
     fn before(
+        ros: RosVersion,
         daemon: Arc<Daemon>,
         robot: &str,
         start: impl FnOnce(&Site, &Daemon, &Cable) -> anyhow::Result<Running>,
     ) -> anyhow::Result<Self> {
         let cable = Cable::new(&daemon.address)?;
-        let site = Site::new()?;
+        let site = Site::of(ros)?;
         let stub = start(&site, &daemon, &cable)?;
         let camera = Camera::new(&site, 10);
         let camera = camera.with_context(|| format!("the stub said:\n{}", stub.said()))?;
@@ -74,7 +77,8 @@ impl Scene {
     /// Shows a picture; its number.
     fn asks(&mut self) -> u32 {
         self.sent += 1;
-        self.camera.image.publish(black(self.sent));
+        let picture = black(self.site.system.version(), self.sent);
+        self.camera.image.publish(picture);
         self.sent
     }
 
@@ -180,11 +184,11 @@ impl Scene {
     }
 }
 
-pub fn a_slow_network_costs_few_requests() -> Verdict {
+pub fn a_slow_network_costs_few_requests(ros: RosVersion) -> Verdict {
     // A servant that is slow to start is not what this is about.
     let more =
         format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0");
-    let mut scene = Scene::new("failover-slow", &more)?;
+    let mut scene = Scene::new(ros, "failover-slow", &more)?;
     for _ in 0..3 {
         let number = scene.asks();
         scene.hears(number)?;
@@ -231,18 +235,26 @@ pub fn a_slow_network_costs_few_requests() -> Verdict {
     Ok(())
 }
 
-pub fn a_lost_link_hands_over_and_back() -> Verdict {
-    let (daemon, robot) = (world().shared()?, "failover-lost");
-    let service = "people_stateful";
-    let push = ["push", "--stateful", "--name", service];
-    let push = [&push, PEOPLE.arguments].concat();
-    daemon.deployer().types(&push)?.succeeded()?;
+pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
+    let daemon = world().shared()?;
+    let robot = &*named("failover-lost", ros);
+    let service = &*format!("people_stateful{}", ros.number());
+    let detector = people::service(ros);
+    let stateful = ["--stateful", "--name", service];
+    let arguments = [&stateful, detector.arguments].concat();
+    match detector.package {
+        Some(package) => daemon.deployer().pushes(package, &arguments)?,
+        None => daemon
+            .deployer()
+            .types(&[&["push"], &arguments[..]].concat())?,
+    }
+    .succeeded()?;
     // Lateness is not what this is about: a busy machine must not hand over.
     let more = "local = \"warm\"\ndesire = 300.0\nmax = 300.0";
-    let mut scene = Scene::before(daemon, robot, |site, daemon, cable| {
+    let mut scene = Scene::before(ros, daemon, robot, |site, daemon, cable| {
         people::installed_stub(site, daemon, cable, (service, robot), more)
     })?;
-    let watcher = scene.site.node("/watcher")?;
+    let watcher = scene.site.joins("/watcher")?;
     let mut diagnostics = scene.site.hears(&watcher, "/diagnostics")?;
     let number = scene.asks();
     scene.hears(number)?;
@@ -274,7 +286,7 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
     // The history tells when it was so, and why.
     let history = scene
         .daemon
-        .api("/api/v1/history/servants?robot=failover-lost")?;
+        .api(&format!("/api/v1/history/servants?robot={robot}"))?;
     let periods = history[0]["local"].as_array().context("periods")?;
     ensure!(periods.len() == 2, "{history:#}");
     for period in periods {
@@ -288,13 +300,14 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
     }
     let listed = scene.daemon.deployer().types(&["events"])?.succeeded()?;
     for words in [
-        "robot failover-lost: /people_detect: the local original takes over: the link is down",
-        "robot failover-lost: /people_detect: the local original hands back: the link is up again",
+        "the local original takes over: the link is down",
+        "the local original hands back: the link is up again",
         // Stateful: each has pictures in its state that the other was not given.
-        "robot failover-lost: /people_detect: the local original goes on without what it was not given: ",
-        "robot failover-lost: /people_detect: the cloud goes on without what it was not given: ",
+        "the local original goes on without what it was not given: ",
+        "the cloud goes on without what it was not given: ",
     ] {
-        ensure!(listed.stdout.contains(words), "{words}: {}", listed.stdout);
+        let words = format!("robot {robot}: /people_detect: {words}");
+        ensure!(listed.stdout.contains(&words), "{words}: {}", listed.stdout);
     }
     let lost = " of /image since ";
     ensure!(listed.stdout.contains(lost), "{}", listed.stdout);
@@ -308,24 +321,28 @@ pub fn a_lost_link_hands_over_and_back() -> Verdict {
     Ok(())
 }
 
-pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Verdict {
+pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original(ros: RosVersion) -> Verdict {
     let rate = 1.0 / T_MAX;
     let more = format!(
         "local = \"cold\"\nframes_per_second = {rate}\nfallback_after = 300.0\n\
          safe_stop = {{ topic = \"/cmd_vel\", type = \"geometry_msgs/Twist\", message = {{ linear = {{ x = -0.5 }} }} }}"
     );
-    let mut scene = Scene::new("failover-frames", &more)?;
-    let wheels = scene.site.node("/wheels")?;
+    let mut scene = Scene::new(ros, "failover-frames", &more)?;
+    let wheels = scene.site.joins("/wheels")?;
     let mut commands = scene.site.hears(&wheels, "/cmd_vel")?;
     let number = scene.asks();
     scene.hears(number)?;
     scene.cable.degrade(SILENT)?;
     // Nobody shows a picture, or nobody could answer: no frame comes in time.
     let command = scene.site.next(&mut commands)?;
+    let (name, header) = match ros {
+        RosVersion::One => ("geometry_msgs/Twist", 0),
+        RosVersion::Two => ("geometry_msgs/msg/Twist", 4),
+    };
     ensure!(
-        command.wire_type.name == "geometry_msgs/Twist"
-            && command.bytes.len() == 48
-            && command.bytes[..8] == (-0.5_f64).to_le_bytes(),
+        command.wire_type.name == name
+            && command.bytes.len() == header + 48
+            && command.bytes[header..header + 8] == (-0.5_f64).to_le_bytes(),
         "{command:?}"
     );
     scene.says("the local original answers, too", 1)?;
@@ -335,12 +352,12 @@ pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original() -> Verdict {
     scene.asks_until("the local original is stopped", 1)
 }
 
-pub fn outputs_that_become_too_old_wake_the_original() -> Verdict {
+pub fn outputs_that_become_too_old_wake_the_original(ros: RosVersion) -> Verdict {
     let desired = T_MAX / 2.0;
     let more = format!(
         "local = \"cold\"\nage = {T_MAX:?}\ndesired_age = {desired:?}\nfallback_after = 300.0"
     );
-    let mut scene = Scene::new("failover-age", &more)?;
+    let mut scene = Scene::new(ros, "failover-age", &more)?;
     scene.explains_link("age", T_MAX * 1e3)?;
     scene.explains_link("desired_age", desired * 1e3)?;
     // Stamps are when a picture was taken: those of our pictures are of 1970, and any answer to them is too old.
@@ -357,11 +374,11 @@ pub fn outputs_that_become_too_old_wake_the_original() -> Verdict {
     scene.says("the local original answers, too", 2)
 }
 
-pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Verdict {
+pub fn a_first_sign_has_the_original_ready_before_it_is_needed(ros: RosVersion) -> Verdict {
     let more = format!(
         "local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0"
     );
-    let mut scene = Scene::new("failover-sign", &more)?;
+    let mut scene = Scene::new(ros, "failover-sign", &more)?;
     let number = scene.asks();
     scene.hears(number)?;
     let started = "the local original is started why=FirstSign";
@@ -390,9 +407,10 @@ pub fn a_first_sign_has_the_original_ready_before_it_is_needed() -> Verdict {
     Ok(())
 }
 
-pub fn explain_says_why() -> Verdict {
+pub fn explain_says_why(ros: RosVersion) -> Verdict {
+    let service = people::service(ros).name;
     let more = format!("local = \"none\"\ndesire = 0.001\nmax = {T_MAX:?}");
-    let mut scene = Scene::new("failover-why", &more)?;
+    let mut scene = Scene::new(ros, "failover-why", &more)?;
     for _ in 0..3 {
         let number = scene.asks();
         scene.hears(number)?;
@@ -412,7 +430,7 @@ pub fn explain_says_why() -> Verdict {
     ] {
         let counted = metrics.lines().any(|line| {
             let count = line.rsplit(' ').next().and_then(|count| count.parse().ok());
-            let of = format!("{family}_count{{service=\"{}\"", PEOPLE.name);
+            let of = format!("{family}_count{{service=\"{service}\"");
             line.starts_with(&of) && count >= Some(3)
         });
         ensure!(counted, "{family}: {metrics}");
@@ -420,16 +438,28 @@ pub fn explain_says_why() -> Verdict {
     // A topic that is named otherwise than it is published.
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
-        scene.daemon.address, PEOPLE.name, scene.robot
+        scene.daemon.address, service, scene.robot
     );
-    let argv = ["__name:=astray", "image:=/nowhere"];
+    let (package, argv): (_, &[&str]) = match ros {
+        RosVersion::One => ("opencv_apps", &["__name:=astray", "image:=/nowhere"]),
+        RosVersion::Two => (
+            "seer_ros2",
+            &[
+                "--ros-args",
+                "-r",
+                "__node:=astray",
+                "-r",
+                "image:=/nowhere",
+            ],
+        ),
+    };
     let _astray = scene
         .site
-        .stub_with(&toml, "opencv_apps", "people_detect", &argv)?;
+        .stub_with(&toml, package, "people_detect", argv)?;
     let _listener = scene.site.hears(&scene.camera.node, "/astray/found")?;
     scene.explains("/nowhere, which nobody on the robot publishes")?;
     // Less of a core than it needs.
-    let servant = scene.daemon.servant_of(PEOPLE.name, &scene.robot)?;
+    let servant = scene.daemon.servant_of(service, &scene.robot)?;
     let id = servant["id"].as_str().context("an id")?;
     let less = ["set", id, "--cpus", "0.05"];
     scene.daemon.deployer().types(&less)?.succeeded()?;
@@ -444,7 +474,7 @@ pub fn explain_says_why() -> Verdict {
         scene
             .camera
             .image
-            .publish(picture(scene.sent, (640, 480), &large));
+            .publish(picture_of(ros, scene.sent, (640, 480), &large));
         ensure!(Instant::now() < deadline, "{:#}", scene.explained()?);
     }
     // More at once than the link takes: all but the newest give way.
@@ -460,8 +490,13 @@ fn now() -> anyhow::Result<u32> {
     Ok(u32::try_from(since.as_secs())?)
 }
 
+/// A robot's name in the story of this ROS.
+fn named(robot: &str, ros: RosVersion) -> String {
+    format!("{robot}-{}", ros.number())
+}
+
 /// A small picture.
-fn black(number: u32) -> Bytes {
+fn black(ros: RosVersion, number: u32) -> Bytes {
     const SIZE: (u32, u32) = (160, 120);
-    picture(number, SIZE, &[0; (SIZE.0 * SIZE.1 * 3) as usize])
+    picture_of(ros, number, SIZE, &[0; (SIZE.0 * SIZE.1 * 3) as usize])
 }

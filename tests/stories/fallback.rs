@@ -5,17 +5,17 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use bytes::{BufMut, Bytes, BytesMut};
-use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
-use ros::ros1::Ros1Bus;
+use bytes::Bytes;
+use ros::bus::{Bus, Message, Publisher, Qos, RosVersion, Subscription, WireType};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::cutter::Cutter;
 use support::daemon::Daemon;
+use support::layout::Layout;
 use support::people;
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
-use support::world::{LOCALISER, world};
+use support::world::{LOCALISER, LOCALISER_TWO, Service, world};
 
 const SILENT: Badness = Badness {
     rate: 100_000,
@@ -24,10 +24,6 @@ const SILENT: Badness = Badness {
     loss: 1.0,
     limit: 1000,
 };
-const PROGRAM: &str = "/opt/cloudroid/install/lib/localiser_py/localiser.py";
-const HEADER: &str = "\
-    ================================================================================\n\
-    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
 
 /// A hall with one wall in it, as a map server has read it: `#` is a wall.
 const HALL: [&str; 8] = [
@@ -48,40 +44,23 @@ struct Robot {
     poses: Subscription,
     scan: Box<dyn Publisher>,
     _map: Box<dyn Publisher>,
-    _server: Arc<Ros1Bus>,
-    node: Arc<Ros1Bus>,
+    _server: Arc<dyn Bus>,
+    node: Arc<dyn Bus>,
     site: Site,
     sent: u32,
 }
 
-fn text(out: &mut BytesMut, text: &str) {
-    out.put_u32_le(u32::try_from(text.len()).unwrap_or(0));
-    out.put_slice(text.as_bytes());
-}
-
-fn header(out: &mut BytesMut, number: u32, frame: &str) {
-    for word in [number, number, 0] {
-        out.put_u32_le(word);
-    }
-    text(out, frame);
-}
-
 /// A nav_msgs/OccupancyGrid.
-fn map() -> Bytes {
-    let mut out = BytesMut::new();
-    header(&mut out, 1, "map");
-    out.put_u64_le(0);
-    out.put_f32_le(RESOLUTION);
-    out.put_u32_le(10);
-    out.put_u32_le(8);
+fn map(ros: RosVersion) -> Bytes {
+    let mut out = Layout::of(ros);
+    out.header(1, "map").u32(0).u32(0);
+    out.f32(RESOLUTION).u32(10).u32(8);
     for number in [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] {
-        out.put_f64_le(number);
+        out.f64(number);
     }
-    out.put_u32_le(80);
-    for cell in HALL.concat().bytes() {
-        out.put_u8(if cell == b'#' { 100 } else { 0 });
-    }
-    out.freeze()
+    let cells = HALL.concat();
+    let cells = cells.bytes().map(|cell| if cell == b'#' { 100 } else { 0 });
+    out.bytes(&cells.collect::<Vec<u8>>()).finish()
 }
 
 /// How far the next wall is in four directions, seen from a cell; metres.
@@ -100,46 +79,39 @@ fn ranges((x, y): (usize, usize)) -> [f32; 4] {
 }
 
 /// A sensor_msgs/LaserScan, stamped with its number.
-fn scan(number: u32, cell: (usize, usize)) -> Bytes {
-    let mut out = BytesMut::new();
-    header(&mut out, number, "laser");
+fn scan(ros: RosVersion, number: u32, cell: (usize, usize)) -> Bytes {
+    let mut out = Layout::of(ros);
+    out.header(number, "laser");
     for number in [0.0, 4.71, 1.57, 0.0, 0.1, 0.0, 10.0] {
-        out.put_f32_le(number);
+        out.f32(number);
     }
-    out.put_u32_le(4);
+    out.u32(4);
     for range in ranges(cell) {
-        out.put_f32_le(range);
+        out.f32(range);
     }
-    out.put_u32_le(0);
-    out.freeze()
+    out.u32(0).finish()
+}
+
+/// Where a pose of a geometry_msgs/PoseStamped begins: its position, which is followed by an orientation.
+fn x_of(pose: &Message) -> usize {
+    pose.bytes.len() - 56
 }
 
 impl Robot {
-    fn new() -> anyhow::Result<Self> {
-        let site = Site::new()?;
-        let (server, node) = (site.node("/map_server")?, site.node("/laser")?);
-        let advertise = |node: &Ros1Bus, topic: &str, latch: bool, wire_type: WireType| {
-            site.runtime.block_on(node.advertise(
-                topic,
-                wire_type,
-                Qos::keep_last(10).latching(latch),
-            ))
+    fn new(ros: RosVersion) -> anyhow::Result<Self> {
+        let site = Site::of(ros)?;
+        let (server, node) = (site.joins("/map_server")?, site.joins("/laser")?);
+        let advertise = |node: &dyn Bus, topic: &str, latch: bool, of: WireType| {
+            let qos = Qos::keep_last(10).latching(latch);
+            site.runtime.block_on(node.advertise(topic, of, qos))
         };
-        let grid = WireType::new(
-            "nav_msgs/OccupancyGrid",
-            "3381f2d731d4076ec5c71b0759edbe4e",
-            format!("{GRID}{HEADER}"),
-        );
-        let map_publisher = advertise(&server, "/map", true, grid)?;
+        let grid = people::type_of(ros, "nav_msgs/OccupancyGrid", &grid(ros))?;
+        let map_publisher = advertise(&*server, "/map", true, grid)?;
         // Once, long before anybody asks.
-        map_publisher.publish(map());
-        let laser = WireType::new(
-            "sensor_msgs/LaserScan",
-            "90c7ef2dc6895d81024acba2ac42f369",
-            format!("{SCAN}{HEADER}"),
-        );
-        let scan = advertise(&node, "/scan", false, laser)?;
-        let poses = site.hears(&node, "/localiser/pose")?;
+        map_publisher.publish(map(ros));
+        let laser = people::type_of(ros, "sensor_msgs/LaserScan", SCAN)?;
+        let scan = advertise(&*node, "/scan", false, laser)?;
+        let poses = site.hears_latched(&node, "/localiser/pose")?;
         Ok(Self {
             poses,
             scan,
@@ -149,6 +121,12 @@ impl Robot {
             site,
             sent: 0,
         })
+    }
+
+    /// Shows a scan of a cell.
+    fn shows(&self, number: u32, cell: (usize, usize)) {
+        let ros = self.site.system.version();
+        self.scan.publish(scan(ros, number, cell));
     }
 
     /// Stub and original as they are installed on a robot.
@@ -164,22 +142,23 @@ impl Robot {
         server: &str,
         settings: &str,
     ) -> anyhow::Result<Running> {
-        let (service, package, node) = (LOCALISER.name, "localiser_py", "localiser.py");
+        let of = localiser(self.site.system.version());
+        let service = of.service.name;
         let overlay = self.site.installs(daemon, service, settings)?;
-        let original = (package, node);
+        let original = (of.package, of.executable);
         let workspace: PathBuf = self
             .site
-            .installs_original(daemon, service, original, PROGRAM)?;
+            .installs_original(daemon, service, original, of.program)?;
         let prefixes = format!("{}:{}", overlay.display(), workspace.display());
         let server = format!("ws://{server}");
         let variables = [
-            ("CMAKE_PREFIX_PATH", prefixes.as_str()),
+            (of.workspaces, prefixes.as_str()),
             ("CLOUDROID_SERVER", server.as_str()),
             ("CLOUDROID_ROBOT", robot),
             ("NO_COLOR", "1"),
         ];
         self.site
-            .runs_among(&variables, &overlay, package, node, &["__name:=localiser"])
+            .runs_among(&variables, &overlay, of.package, of.executable, of.argv)
     }
 
     /// Shows scans of a cell until one is answered; the answer is right.
@@ -188,13 +167,13 @@ impl Robot {
         let deadline = Instant::now() + PATIENCE;
         loop {
             self.sent += 1;
-            self.scan.publish(scan(self.sent, cell));
+            self.shows(self.sent, cell);
             let heard = self.site.runtime.block_on(async {
                 let pause = Duration::from_millis(100);
                 tokio::time::timeout(pause, self.poses.messages.recv()).await
             });
             if let Ok(Some(pose)) = heard {
-                let place = pose.bytes.len() - 56;
+                let place = x_of(&pose);
                 let number = |at: usize| {
                     let bytes = pose.bytes[place + at..place + at + 8].try_into();
                     bytes.map(f64::from_le_bytes)
@@ -231,11 +210,17 @@ fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Verdict {
     }
 }
 
-pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
+pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back(
+    ros: RosVersion,
+) -> Verdict {
+    let daemon = world().with(localiser(ros).service)?;
     let cable = Cable::new(&daemon.address)?;
-    let mut robot = Robot::new()?;
-    let stub = robot.starts(&daemon, "fallback-cut", &cable.server.to_string())?;
+    let mut robot = Robot::new(ros)?;
+    let stub = robot.starts(
+        &daemon,
+        &named("fallback-cut", ros),
+        &cable.server.to_string(),
+    )?;
     says(&stub, "linked to", 1)?;
     robot.is_found((2, 4), &stub)?;
     let mut diagnostics = robot.site.hears(&robot.node, "/diagnostics")?;
@@ -261,45 +246,51 @@ pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back() ->
             "the link is down, the local original answers",
         )?;
         let words = "where the original is installed on the robot, it stands in after 3.0 s";
-        daemon.awaits("/api/v1/robots/fallback-cut/explain", words, |explained| {
+        let name = named("fallback-cut", ros);
+        let path = format!("/api/v1/robots/{name}/explain");
+        daemon.awaits(&path, words, |explained| {
             explained["causes"]
                 .to_string()
                 .contains(words)
                 .then_some(())
         })?;
-        let explained = daemon.deployer().types(&["explain", "fallback-cut"])?;
+        let explained = daemon.deployer().types(&["explain", &name])?;
         let explained = explained.succeeded()?.stdout;
         let words = "no time promised, fallback 3.0 s after the link is lost";
         ensure!(explained.contains(words), "{explained}");
         // Who comes now is given what the original has latched, not the cloud's last pose.
-        let newcomer = robot.site.node(&format!("/newcomer{round}"))?;
-        let mut late = robot.site.hears(&newcomer, "/localiser/pose")?;
+        let newcomer = robot.site.joins(&format!("/newcomer{round}"))?;
+        let mut late = robot.site.hears_latched(&newcomer, "/localiser/pose")?;
         let pose = robot.site.next(&mut late)?;
-        let x = pose.bytes.len() - 56;
+        let x = x_of(&pose);
         ensure!(pose.bytes[x..x + 8] == 3.25_f64.to_le_bytes(), "{pose:?}");
         cable.restore()?;
         says(&stub, back, before + round)?;
         robot.is_found((1, 1), &stub)?;
         // The cloud's last pose has taken the place of the original's.
-        let newcomer = robot.site.node(&format!("/later{round}"))?;
-        let mut late = robot.site.hears(&newcomer, "/localiser/pose")?;
+        let newcomer = robot.site.joins(&format!("/later{round}"))?;
+        let mut late = robot.site.hears_latched(&newcomer, "/localiser/pose")?;
         let pose = robot.site.next(&mut late)?;
-        let x = pose.bytes.len() - 56;
+        let x = x_of(&pose);
         ensure!(pose.bytes[x..x + 8] == 0.75_f64.to_le_bytes(), "{pose:?}");
     }
     // Told when the link is back.
     daemon.awaits_event("that its original took over", |event| {
-        event["robot"] == "fallback-cut" && event["kind"] == "local-takes-over"
+        event["robot"] == *named("fallback-cut", ros) && event["kind"] == "local-takes-over"
     })?;
     Ok(())
 }
 
-pub fn a_server_that_was_never_reached_is_stood_in_for_until_it_comes() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
-    let mut robot = Robot::new()?;
+pub fn a_server_that_was_never_reached_is_stood_in_for_until_it_comes(ros: RosVersion) -> Verdict {
+    let daemon = world().with(localiser(ros).service)?;
+    let mut robot = Robot::new(ros)?;
     let way = Cutter::new(&daemon.address, 0, 1, 1)?;
     way.cut(true);
-    let stub = robot.starts(&daemon, "fallback-never", &way.server.to_string())?;
+    let stub = robot.starts(
+        &daemon,
+        &named("fallback-never", ros),
+        &way.server.to_string(),
+    )?;
     says(&stub, "no link: ", 1)?;
     robot.is_found((6, 6), &stub)?;
     says(&stub, "the local original answers, too why=LinkDown", 1)?;
@@ -310,15 +301,15 @@ pub fn a_server_that_was_never_reached_is_stood_in_for_until_it_comes() -> Verdi
     robot.is_found((1, 1), &stub)
 }
 
-pub fn a_promise_holds_without_a_server_too_until_it_comes() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
-    let mut robot = Robot::new()?;
+pub fn a_promise_holds_without_a_server_too_until_it_comes(ros: RosVersion) -> Verdict {
+    let daemon = world().with(localiser(ros).service)?;
+    let mut robot = Robot::new(ros)?;
     let way = Cutter::new(&daemon.address, 0, 1, 1)?;
     way.cut(true);
     // Nobody can ask for anything before somebody has registered what the node listens to.
     let settings = "desire = 20.0\nmax = 20.0\nfallback_after = 1.0\n";
     let server = way.server.to_string();
-    let stub = robot.starts_with(&daemon, "fallback-promise", &server, settings)?;
+    let stub = robot.starts_with(&daemon, &named("fallback-promise", ros), &server, settings)?;
     says(&stub, "the local original answers, too why=LinkDown", 1)?;
     robot.is_found((6, 6), &stub)?;
     ensure!(!stub.said().contains("linked to"), "{}", stub.said());
@@ -333,14 +324,14 @@ pub fn a_promise_holds_without_a_server_too_until_it_comes() -> Verdict {
     robot.is_found((2, 4), &stub)
 }
 
-pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
-    let mut robot = Robot::new()?;
+pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing(ros: RosVersion) -> Verdict {
+    let daemon = world().with(localiser(ros).service)?;
+    let mut robot = Robot::new(ros)?;
     let way = Cutter::new(&daemon.address, 0, 1, 1)?;
     // One late request would start the original, and nothing is late within five minutes.
     let settings = "desire = 300.0\nmax = 300.0\nfallback_after = 300.0\nthreshold = 4.0\ninitial = 5.0\ncap = 6.0\n";
     let server = way.server.to_string();
-    let stub = robot.starts_with(&daemon, "fallback-blip", &server, settings)?;
+    let stub = robot.starts_with(&daemon, &named("fallback-blip", ros), &server, settings)?;
     says(&stub, "linked to", 1)?;
     robot.site.connected(&*robot.scan, 1)?;
     robot.is_found((2, 4), &stub)?;
@@ -348,12 +339,12 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing() -> Verdict {
         let number = 1_000_000 + round;
         // Now it is on its way when the link is lost, now it is asked while there is none.
         if round % 2 == 0 {
-            robot.scan.publish(scan(number, (1, 1)));
+            robot.shows(number, (1, 1));
         }
         way.cut(true);
         std::thread::sleep(Duration::from_millis(50));
         if round % 2 == 1 {
-            robot.scan.publish(scan(number, (1, 1)));
+            robot.shows(number, (1, 1));
         }
         way.cut(false);
         loop {
@@ -370,9 +361,9 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing() -> Verdict {
     let said = stub.said();
     ensure!(said.contains("was lost"), "it was not cut: {said}");
     ensure!(!said.contains("the local original is started"), "{said}");
-    let path = "/api/v1/robots/fallback-blip/explain";
+    let path = format!("/api/v1/robots/{}/explain", named("fallback-blip", ros));
     // All were answered; they are counted from when the stub has found out which output answers which input.
-    let link = daemon.awaits(path, "requests that are told", |explained| {
+    let link = daemon.awaits(&path, "requests that are told", |explained| {
         let link = &explained["servants"][0]["links"][0];
         (link["requests"].as_u64() >= Some(1)).then(|| link.clone())
     })?;
@@ -380,29 +371,13 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing() -> Verdict {
     Ok(())
 }
 
-pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
-    let robot = Robot::new()?;
-    let overlay = robot
-        .site
-        .installs(&daemon, LOCALISER.name, "local = \"none\"\n")?;
-    let workspace = robot.site.installs_original(
-        &daemon,
-        LOCALISER.name,
-        ("localiser_py", "localiser.py"),
-        PROGRAM,
-    )?;
-    let prefixes = format!("{}:{}", overlay.display(), workspace.display());
-    let variables = [
-        ("CMAKE_PREFIX_PATH", prefixes.as_str()),
-        ("CLOUDROID_ROBOT", "fallback-none"),
-        ("NO_COLOR", "1"),
-    ];
-    let stub = robot
-        .site
-        .runs_among(&variables, &overlay, "localiser_py", "localiser.py", &[])?;
+pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone(ros: RosVersion) -> Verdict {
+    let daemon = world().with(localiser(ros).service)?;
+    let robot = Robot::new(ros)?;
+    let (name, server) = (named("fallback-none", ros), daemon.address.clone());
+    let stub = robot.starts_with(&daemon, &name, &server, "local = \"none\"\n")?;
     says(&stub, "linked to", 1)?;
-    let explained = daemon.deployer().asks(&["explain", "fallback-none"])?;
+    let explained = daemon.deployer().asks(&["explain", &name])?;
     let link = &explained["servants"][0]["links"][0];
     ensure!(link["fallback_after"].is_null(), "{explained:#}");
     let graph = robot.node.graph().borrow().clone();
@@ -413,16 +388,61 @@ pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone() -> Verdict {
     Ok(())
 }
 
+/// A localiser in one ROS, and how it is installed on a robot.
+struct Localiser {
+    service: Service,
+    package: &'static str,
+    executable: &'static str,
+    program: &'static str,
+    argv: &'static [&'static str],
+    /// The variable on which workspaces stand.
+    workspaces: &'static str,
+}
+
+fn localiser(ros: RosVersion) -> Localiser {
+    match ros {
+        RosVersion::One => Localiser {
+            service: LOCALISER,
+            package: "localiser_py",
+            executable: "localiser.py",
+            program: "/opt/cloudroid/install/lib/localiser_py/localiser.py",
+            argv: &["__name:=localiser"],
+            workspaces: "CMAKE_PREFIX_PATH",
+        },
+        RosVersion::Two => Localiser {
+            service: LOCALISER_TWO,
+            package: "localiser_ros2",
+            executable: "localiser",
+            program: "/opt/cloudroid/install/lib/localiser_ros2/localiser",
+            argv: &["--ros-args", "-r", "__node:=localiser"],
+            workspaces: "AMENT_PREFIX_PATH",
+        },
+    }
+}
+
+/// A robot's name in the story of this ROS.
+fn named(robot: &str, ros: RosVersion) -> String {
+    format!("{robot}-{}", ros.number())
+}
+
+/// The definition of nav_msgs/OccupancyGrid without its header's.
+fn grid(ros: RosVersion) -> String {
+    match ros {
+        RosVersion::One => GRID.to_owned(),
+        RosVersion::Two => GRID.replace("\ntime ", "\nbuiltin_interfaces/Time "),
+    }
+}
+
 const GRID: &str = "std_msgs/Header header\nnav_msgs/MapMetaData info\nint8[] data\n\
     ================================================================================\n\
     MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\n\
     geometry_msgs/Pose origin\n\
     ================================================================================\n\
-    MSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n\
+    MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n\
     ================================================================================\n\
     MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n\
     ================================================================================\n\
     MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n";
-const SCAN: &str = "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n\
+const SCAN: &str = "std_msgs/Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\n\
     float32 time_increment\nfloat32 scan_time\nfloat32 range_min\nfloat32 range_max\nfloat32[] ranges\n\
     float32[] intensities\n";

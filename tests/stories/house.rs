@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::ensure;
+use ros::bus::RosVersion;
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
-use support::world::{PEOPLE, world};
+use support::world::{PEOPLE, SEER, world};
 use support::{Verdict, binaries, leftovers};
 
 pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
@@ -128,10 +129,14 @@ pub fn a_taken_port_is_named() -> Verdict {
     Ok(())
 }
 
-pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Verdict {
-    // The demo's daemon fetches nothing that the shared one has not left in the cache.
-    world().with(PEOPLE)?;
-    let home = world().home("demo");
+pub fn the_demo_ends_by_itself_and_leaves_nothing(ros: RosVersion) -> Verdict {
+    let (service, answered, picture) = match ros {
+        RosVersion::One => (PEOPLE, "people found", "people.png"),
+        RosVersion::Two => (SEER, "14 of 14 pictures answered as recorded", "board.png"),
+    };
+    // The demo's daemon finds in the cache what the shared one has fetched for its base.
+    world().with(service)?;
+    let home = world().home(&format!("demo{}", ros.number()));
     let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
     let binaries = binaries::path("cloudroidd")
         .parent()
@@ -140,15 +145,12 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing() -> Verdict {
     let outcome = run(Command::new(binaries::checkout().join("demo/demo"))
         .env("BIN", binaries)
         .env("CHECK", "1")
+        .env("ROS", ros.number().to_string())
         .env("CLOUDROID_HOME", &home)
         .env("CLOUDROID_LISTEN", format!("127.0.0.1:{port}")))?
     .succeeded()?;
-    ensure!(
-        outcome.stdout.contains("people found"),
-        "{}",
-        outcome.said()
-    );
-    ensure!(home.join("people.png").exists());
+    ensure!(outcome.stdout.contains(answered), "{}", outcome.said());
+    ensure!(home.join(picture).exists());
     let left = leftovers::of(&home);
     ensure!(left.is_empty(), "left behind: {left:#?}");
     Ok(())

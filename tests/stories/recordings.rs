@@ -281,7 +281,7 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         (
             &["replay", path_str(&foreign), "--to", servant],
             1,
-            &["/chatter was left out", "servants take ros1"],
+            &["/chatter was left out", "this servant takes ros1"],
         ),
         (
             &["replay", path_str(&text), "--to", servant, "--rate", "0"],

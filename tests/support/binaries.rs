@@ -42,6 +42,13 @@ pub fn python() -> PathBuf {
         .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
 }
 
+/// The environment with rclpy (see scripts/ros2-wheels).
+pub fn ros2() -> PathBuf {
+    std::env::var_os("CLOUDROID_ROS2_PREFIX")
+        .map(PathBuf::from)
+        .expect("CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the stories by make stories")
+}
+
 /// The programs of Python packages that read what the daemon answers by HTTP (see scripts/python).
 pub fn readers() -> PathBuf {
     std::env::var_os("CLOUDROID_READERS")

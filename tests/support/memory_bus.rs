@@ -14,9 +14,9 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
-    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, NodeParameters, Outcome,
-    ParamValue, Peer, PeerId, Publisher, Qos, Refusal, RosVersion, ServiceHandler, ServiceType,
-    Subscription, TopicNodes, WireFormat, WireType, message_queue,
+    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, NodeEnds, NodeParameters, Outcome,
+    ParamValue, Peer, PeerId, Publisher, Qos, Refusal, Reliability, RosVersion, ServiceHandler,
+    ServiceType, Subscription, TopicNodes, WireFormat, WireType, message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
@@ -38,6 +38,8 @@ struct State {
     topics: BTreeMap<String, Topic>,
     services: BTreeMap<String, Service>,
     actions: BTreeMap<String, Action>,
+    /// Services that nodes may call, by number: the node, the name and the type.
+    clients: BTreeMap<u128, (String, String, ServiceType)>,
 }
 
 #[derive(Default)]
@@ -198,6 +200,15 @@ impl State {
         let services = services.map(|(name, it)| (name.clone(), it.node.clone()));
         let lists = self.parameters.keys();
         let lists = lists.map(|node| (format!("{node}/list_parameters"), node.clone()));
+        let mut sought: BTreeMap<String, Vec<String>> = BTreeMap::new();
+        for (node, service, _) in self.clients.values() {
+            if !self.services.contains_key(service) {
+                sought
+                    .entry(service.clone())
+                    .or_default()
+                    .push(node.clone());
+            }
+        }
         let nodes = self.nodes.iter();
         Graph {
             generation,
@@ -207,8 +218,42 @@ impl State {
             nodes: nodes
                 .map(|name| (name.clone(), "memory".to_owned()))
                 .collect(),
+            sought,
+            ends: self.ends(),
             ..Graph::default()
         }
+    }
+}
+
+impl State {
+    /// What each node has. What is no demand asks for nothing.
+    fn ends(&self) -> BTreeMap<String, NodeEnds> {
+        let mut all: BTreeMap<String, NodeEnds> = BTreeMap::new();
+        for (name, topic) in &self.topics {
+            for publisher in &topic.publishers {
+                let ends = all.entry(publisher.id.node().to_owned()).or_default();
+                let end = (WireType::clone(&publisher.of), publisher.qos);
+                ends.publishers.insert(name.clone(), end);
+            }
+            for listener in &topic.subscribers {
+                let ends = all.entry(listener.id.node().to_owned()).or_default();
+                let nothing = Qos {
+                    reliability: Reliability::BestEffort,
+                    ..Qos::keep_last(1)
+                };
+                let end = (listener.of.clone(), listener.demanded.unwrap_or(nothing));
+                ends.subscribers.insert(name.clone(), end);
+            }
+        }
+        for (name, served) in &self.services {
+            let ends = all.entry(served.node.clone()).or_default();
+            ends.services.insert(name.clone(), served.of.clone());
+        }
+        for (node, service, of) in self.clients.values() {
+            let ends = all.entry(node.clone()).or_default();
+            ends.clients.insert(service.clone(), of.clone());
+        }
+        all
     }
 }
 
@@ -282,9 +327,21 @@ impl Drop for Guard {
 }
 
 impl MemoryBus {
-    fn guard(&self, undo: impl FnOnce(&mut State) + Send + Sync + 'static) -> Guard {
+    fn guard<T>(&self, undo: impl FnOnce(&mut State) -> T + Send + Sync + 'static) -> Guard {
         let system = self.system.clone();
-        Guard(Some(Box::new(move || system.change(undo))))
+        Guard(Some(Box::new(move || drop(system.change(undo)))))
+    }
+
+    /// From now on it is seen that this node may call a service, until the guard is dropped.
+    #[allow(dead_code, reason = "who includes this file need not have such nodes")]
+    pub fn seek(&self, service: &str, of: ServiceType) -> Box<dyn Send + Sync> {
+        let number = self.system.change(|state| {
+            let number = state.number();
+            let client = (self.node.clone(), service.to_owned(), of);
+            state.clients.insert(number, client);
+            number
+        });
+        Box::new(self.guard(move |state| state.clients.remove(&number)))
     }
 
     fn served(&self, service: &str) -> Result<(ServiceType, Arc<dyn ServiceHandler>), BusError> {

@@ -1,4 +1,4 @@
-//! A robot's side of a link: a ROS Master, the robot's own nodes, and stubs in place of what runs in the cloud.
+//! A robot's side of a link: a ROS system, the robot's own nodes, and stubs in place of what runs in the cloud.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -12,27 +12,27 @@ use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use ros::bus::{Bus, Graph, Message, Publisher, Qos, Subscription, WireType};
+use ros::bus::{
+    Bus, Graph, Message, Publisher, Qos, RosVersion, Subscription, WireFormat, WireType,
+};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
-use ros::ros1::master::{Master, MasterOptions};
+use ros::schema::MessageType;
 use tempfile::TempDir;
-use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
-use tokio::task::JoinHandle;
 
 use crate::binaries;
 use crate::daemon::Daemon;
 use crate::deployer::path_str;
 use crate::robot::PATIENCE;
+use crate::ros_system::{Node, RosSystem};
 
 /// A robot.
 pub struct Site {
     /// Where its nodes of this process run.
     pub runtime: Runtime,
-    /// Where its Master listens.
-    pub master: SocketAddr,
-    serving: Option<JoinHandle<()>>,
+    /// Its ROS.
+    pub system: RosSystem,
     place: TempDir,
 }
 
@@ -43,8 +43,13 @@ pub struct Running {
 }
 
 impl Site {
-    /// A robot with nothing but a Master.
+    /// A robot of ROS 1 with nothing but a Master.
     pub fn new() -> anyhow::Result<Self> {
+        Self::of(RosVersion::One)
+    }
+
+    /// A robot of this ROS, without a node.
+    pub fn of(version: RosVersion) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -52,49 +57,47 @@ impl Site {
         let place = tempfile::Builder::new()
             .prefix("cloudroid-site-")
             .tempdir()?;
-        let mut site = Self {
+        Ok(Self {
+            system: RosSystem::new(version, &runtime)?,
             runtime,
-            master: ([127, 0, 0, 1], 0).into(),
-            serving: None,
             place,
-        };
-        site.start_master()?;
-        Ok(site)
+        })
+    }
+
+    /// Where its Master listens.
+    pub fn master(&self) -> anyhow::Result<SocketAddr> {
+        self.system.master().context("a robot of ROS 1")
     }
 
     /// Starts a Master, where the last one was if there was one.
     pub fn start_master(&mut self) -> anyhow::Result<()> {
-        let at = self.master;
-        let listener = self.runtime.block_on(TcpListener::bind(at))?;
-        self.master = listener.local_addr()?;
-        let master = Master::new(MasterOptions::default());
-        let serving = async move { master.serve(listener, Arc::new(HostSockets)).await };
-        self.serving = Some(self.runtime.spawn(serving));
-        Ok(())
+        self.system.start_master(&self.runtime)
     }
 
     /// Ends the Master; what was registered there is forgotten.
     pub fn end_master(&mut self) {
-        if let Some(serving) = self.serving.take() {
-            serving.abort();
-            let _ = self.runtime.block_on(serving);
-        }
+        self.system.end_master(&self.runtime);
     }
 
-    /// A node of this process.
+    /// A node of this process, on a robot of ROS 1.
     pub fn node(&self, name: &str) -> anyhow::Result<Arc<Ros1Bus>> {
-        let joined = Ros1Bus::connect(Arc::new(HostSockets), self.master, name);
+        let joined = Ros1Bus::connect(Arc::new(HostSockets), self.master()?, name);
         Ok(self.runtime.block_on(joined)?)
+    }
+
+    /// A node of this process, on a robot of either ROS.
+    pub fn joins(&self, name: &str) -> anyhow::Result<Arc<dyn Bus>> {
+        self.runtime.block_on(self.system.join(name))
     }
 
     /// Waits until the graph is as wanted.
     pub fn until(
         &self,
-        node: &Ros1Bus,
+        node: &(impl Node + ?Sized),
         what: &str,
         wanted: impl Fn(&Graph) -> bool,
     ) -> anyhow::Result<Graph> {
-        let mut graphs = node.graph();
+        let mut graphs = node.bus().graph();
         let found = self.runtime.block_on(async {
             let found = tokio::time::timeout(PATIENCE, graphs.wait_for(|graph| wanted(graph)));
             found
@@ -103,33 +106,44 @@ impl Site {
         });
         match found {
             Ok(graph) => Ok(graph?),
-            Err(_) => bail!("{what} did not come about: {:#?}", node.graph().borrow()),
+            Err(_) => bail!(
+                "{what} did not come about: {:#?}",
+                node.bus().graph().borrow()
+            ),
         }
     }
 
     /// Advertises a topic of strings.
     pub fn says(
         &self,
-        node: &Ros1Bus,
+        node: &(impl Node + ?Sized),
         topic: &str,
         latch: bool,
     ) -> anyhow::Result<Box<dyn Publisher>> {
-        Ok(self.runtime.block_on(node.advertise(
-            topic,
-            WireType::new(
-                "std_msgs/String",
-                "992ce8a1687cec8c8bd883ec73ca41d1",
-                "string data\n",
-            ),
-            Qos::keep_last(100).latching(latch),
-        ))?)
+        let of = string_type(self.system.version())?;
+        let qos = Qos::keep_last(100).latching(latch);
+        Ok(self
+            .runtime
+            .block_on(node.bus().advertise(topic, of, qos))?)
     }
 
     /// Subscribes to a topic of any type.
-    pub fn hears(&self, node: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
-        Ok(self
-            .runtime
-            .block_on(node.subscribe(topic, WireType::any(), Qos::keep_last(100)))?)
+    pub fn hears(&self, node: &(impl Node + ?Sized), topic: &str) -> anyhow::Result<Subscription> {
+        let subscribed = node
+            .bus()
+            .subscribe(topic, WireType::any(), Qos::keep_last(100));
+        Ok(self.runtime.block_on(subscribed)?)
+    }
+
+    /// The same, with what publishers have latched, which a newcomer of ROS 2 has to ask for.
+    pub fn hears_latched(
+        &self,
+        node: &(impl Node + ?Sized),
+        topic: &str,
+    ) -> anyhow::Result<Subscription> {
+        let qos = Qos::keep_last(100).latching(true);
+        let subscribed = node.bus().subscribe(topic, WireType::any(), qos);
+        Ok(self.runtime.block_on(subscribed)?)
     }
 
     /// The next message.
@@ -187,11 +201,15 @@ impl Site {
     }
 
     /// Calls a service.
-    pub fn calls(&self, node: &Ros1Bus, service: &str, request: &[u8]) -> anyhow::Result<Bytes> {
+    pub fn calls(
+        &self,
+        node: &(impl Node + ?Sized),
+        service: &str,
+        request: &[u8],
+    ) -> anyhow::Result<Bytes> {
         let request = Bytes::copy_from_slice(request);
-        Ok(self
-            .runtime
-            .block_on(node.call(service, request, PATIENCE))?)
+        let called = node.bus().call(service, request, PATIENCE);
+        Ok(self.runtime.block_on(called)?)
     }
 
     /// Starts a stub for an executable of a service of the daemon, as robot `robot`.
@@ -236,6 +254,8 @@ impl Site {
         let share = overlay.join("share").join(package);
         std::fs::create_dir_all(&share)?;
         std::fs::write(share.join("stub.toml"), toml)?;
+        let ros = self.system.version().number();
+        std::fs::write(share.join("revision.toml"), format!("ros = {ros}\n"))?;
         let mut command = Command::new(binaries::path("stubs/x86_64/cloudroid-stub"));
         command
             .args(["run", "--package", package, "--node", executable, "--share"])
@@ -276,6 +296,10 @@ impl Site {
         let overlay = place.join(format!("{service}-stub"));
         for package in std::fs::read_dir(overlay.join("share"))? {
             let path = package?.path().join("stub.toml");
+            // The index of ROS 2 stands beside the package.
+            if !path.exists() {
+                continue;
+            }
             let text = std::fs::read_to_string(&path)?;
             std::fs::write(path, format!("{text}{settings}"))?;
         }
@@ -341,8 +365,8 @@ impl Site {
         self.starts_in_image(&script, program, &argv)
     }
 
-    /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, whose
-    /// program becomes the original in the image's root file system.
+    /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, or of ROS 2 on
+    /// AMENT_PREFIX_PATH, whose program becomes the original in the image's root file system.
     pub fn installs_original(
         &self,
         daemon: &Daemon,
@@ -353,10 +377,21 @@ impl Site {
         let prefix = self.place.path().join("installed").join(package);
         let launcher = prefix.join("lib").join(package).join(executable);
         std::fs::create_dir_all(launcher.parent().context("a directory")?)?;
-        std::fs::write(prefix.join(".catkin"), "")?;
         let script = self.in_image(daemon, service)?;
+        let variables = match self.system.version() {
+            RosVersion::One => {
+                std::fs::write(prefix.join(".catkin"), "")?;
+                "HOME=/root".to_owned()
+            }
+            RosVersion::Two => {
+                let index = prefix.join("share/ament_index/resource_index/packages");
+                std::fs::create_dir_all(&index)?;
+                std::fs::write(index.join(package), "")?;
+                format!("HOME=/root {}", image_environment(daemon, service)?)
+            }
+        };
         let text = format!(
-            "#!/bin/sh\nexport HOME=/root\nexec unshare --mount sh -c '{script}' sh {program} \"$@\"\n"
+            "#!/bin/sh\nexec unshare --mount sh -c '{script}' sh env {variables} {program} \"$@\"\n"
         );
         std::fs::write(&launcher, text)?;
         let executable = std::os::unix::fs::PermissionsExt::from_mode(0o755);
@@ -386,9 +421,8 @@ impl Site {
 
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {
         let file = File::create(log)?;
+        self.system.is_of(&mut command);
         let child = command
-            .env("ROS_MASTER_URI", format!("http://{}", self.master))
-            .env_remove("ROS_NAMESPACE")
             .stdin(Stdio::null())
             .stdout(file.try_clone()?)
             .stderr(file)
@@ -427,6 +461,20 @@ pub fn image_config(daemon: &Daemon, service: &str) -> anyhow::Result<serde_json
     let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
     let config = manifest["config"]["digest"].as_str().context("a config")?;
     daemon.get_json(&format!("/v2/{service}/blobs/{config}"))
+}
+
+/// The variables of a service's image as `env` takes them, but for those that say which ROS system is joined.
+fn image_environment(daemon: &Daemon, service: &str) -> anyhow::Result<String> {
+    let config = image_config(daemon, service)?;
+    let variables = config["config"]["Env"].as_array().context("variables")?;
+    let variables = variables.iter().filter_map(|variable| variable.as_str());
+    let kept = variables.filter(|variable| {
+        !["ROS_DOMAIN_ID", "ROS_AUTOMATIC", "HOME="]
+            .iter()
+            .any(|own| variable.starts_with(own))
+    });
+    let quoted = kept.map(|variable| format!("'{}'", variable.replace('\'', "")));
+    Ok(quoted.collect::<Vec<_>>().join(" "))
 }
 
 /// Where a layer is extracted.
@@ -515,12 +563,30 @@ pub fn registered(graph: &Graph, node: &str) -> BTreeSet<String> {
     lines
 }
 
-/// A serialized std_msgs/String.
+/// The type of strings in either ROS.
+pub fn string_type(version: RosVersion) -> anyhow::Result<WireType> {
+    let name = match version {
+        RosVersion::One => "std_msgs/String",
+        RosVersion::Two => "std_msgs/msg/String",
+    };
+    let of = MessageType::of_full_text(version, name, "string data\n")?;
+    Ok(WireType::of(&of))
+}
+
+/// A serialized std_msgs/String of ROS 1.
 pub fn string(text: &str) -> Bytes {
-    let mut bytes = u32::try_from(text.len())
-        .unwrap_or(0)
-        .to_le_bytes()
-        .to_vec();
-    bytes.extend(text.as_bytes());
-    bytes.into()
+    string_of(WireFormat::Ros1, text)
+}
+
+/// A serialized string in this format.
+pub fn string_of(format: WireFormat, text: &str) -> Bytes {
+    let (header, end): (&[u8], &[u8]) = match format {
+        WireFormat::Ros1 => (&[], &[]),
+        // Little endian, and strings that end with a zero.
+        WireFormat::Cdr => (&[0, 1, 0, 0], &[0]),
+    };
+    let length = u32::try_from(text.len() + end.len()).unwrap_or(0);
+    [header, &length.to_le_bytes(), text.as_bytes(), end]
+        .concat()
+        .into()
 }

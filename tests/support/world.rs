@@ -49,6 +49,13 @@ pub const PEOPLE: Service = Service {
     ],
 };
 
+/// What does the same in ROS 2.
+pub const SEER: Service = Service {
+    name: "seer_ros2",
+    package: Some("seer_ros2"),
+    arguments: &["--node", "people_detect"],
+};
+
 /// Our C++ package, compiled at push.
 pub const GREETER: Service = Service {
     name: "greeter_cpp",
@@ -82,6 +89,20 @@ pub const LOCALISER: Service = Service {
     name: "localiser_py",
     package: Some("localiser_py"),
     arguments: &["--node", "localiser.py"],
+};
+
+/// The same for ROS 2.
+pub const LOCALISER_TWO: Service = Service {
+    name: "localiser_ros2",
+    package: Some("localiser_ros2"),
+    arguments: &["--node", "localiser"],
+};
+
+/// A workspace of ROS 2 with interfaces of its own, and a node that uses them.
+pub const HERALD: Service = Service {
+    name: "herald",
+    package: Some("herald_ros2"),
+    arguments: &["--name", "herald", "--node", "herald/herald"],
 };
 
 /// Our C++ package that calls services of others.

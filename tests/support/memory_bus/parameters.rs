@@ -3,7 +3,7 @@
 use async_trait::async_trait;
 use ros::bus::{
     BusError, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvents,
-    ParameterNames,
+    ParameterKind, ParameterNames,
 };
 
 use super::MemoryBus;
@@ -81,10 +81,25 @@ impl NodeParameters for MemoryBus {
 
     async fn describe(
         &self,
-        _node: &str,
-        _names: &[String],
+        node: &str,
+        names: &[String],
     ) -> Result<Vec<Option<ParameterDescription>>, BusError> {
-        Err(BusError::NotOffered("descriptions of parameters"))
+        let values = self.get(node, names).await?;
+        let described = names.iter().zip(values).map(|(name, value)| {
+            value.map(|value| ParameterDescription {
+                name: name.clone(),
+                kind: match value {
+                    ParamValue::Bool(_) => ParameterKind::Bool,
+                    ParamValue::Int(_) => ParameterKind::Integer,
+                    ParamValue::Double(_) => ParameterKind::Double,
+                    ParamValue::String(_) => ParameterKind::String,
+                    _ => ParameterKind::NotSet,
+                },
+                description: format!("{name} of {node}"),
+                ..ParameterDescription::default()
+            })
+        });
+        Ok(described.collect())
     }
 
     async fn watch(&self, _node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {

@@ -1,0 +1,359 @@
+//! Packages of ROS 2, by rosbridge and by stubs. What a robot sees of a stub when the link is bad is told in [`crate::failover`] and
+//! [`crate::fallback`], for both ROSes.
+
+use std::process::Command;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use bytes::Bytes;
+use nix::sys::signal::Signal;
+use parking_lot::Mutex;
+use ros::bus::{
+    Bus, BusError, GoalEnd, GoalEvents, Graph, NodeEnds, Outcome, ParamValue, RosVersion,
+    WireFormat,
+};
+use ros::schema::{ActionDef, Registry};
+use serde_json::{Value, json};
+use support::cable::Cable;
+use support::deployer::run;
+use support::layout::Layout;
+use support::people;
+use support::robot::PATIENCE;
+use support::site::{Running, Site, string_of};
+use support::world::{ADDER, HERALD, SEER, world};
+use support::{Verdict, binaries};
+use tokio::sync::Notify;
+
+/// For an answer that may never come.
+const MEANWHILE: Duration = Duration::from_secs(5);
+const THE_HERALD: (&str, &str, &str) = ("herald", "herald", "herald");
+
+fn serves(service: &str) -> impl Fn(&Graph) -> bool {
+    let service = service.to_owned();
+    move |graph| graph.services.contains_key(&service)
+}
+
+/// The message with what the node said when it fails.
+fn with_log<T>(outcome: anyhow::Result<T>, node: &Running) -> anyhow::Result<T> {
+    outcome.with_context(|| format!("the stub said:\n{}", node.said()))
+}
+
+fn contains(message: &[u8], text: &str) -> bool {
+    String::from_utf8_lossy(message).contains(text)
+}
+
+pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
+    let daemon = world().with(HERALD)?;
+    let service = daemon.get_json("/api/v1/services/herald")?;
+    let names = |what: &str| -> anyhow::Result<Vec<String>> {
+        let all = service["interface"][what].as_array().context("a list")?;
+        let names = all.iter().filter_map(|one| one["name"].as_str());
+        Ok(names.map(str::to_owned).collect())
+    };
+    // What every node has is not what a service is for.
+    ensure!(
+        names("topics")? == ["/greeting", "/name"] && names("services")? == ["/greet"],
+        "{service:#}"
+    );
+    ensure!(names("actions")? == ["/count"], "{service:#}");
+    let mut robot = daemon.robot("herald?robot=herald-asked")?;
+    let greeted = robot.calls("/greet", json!({"name": "robot"}))?;
+    let greeting = &greeted["values"]["greeting"];
+    ensure!(
+        greeting["text"] == "Hello, robot" && greeting["wide"] == "HELLO, ROBOT",
+        "{greeted}"
+    );
+    robot.says(json!({"op": "subscribe", "topic": "/greeting", "qos": {"reliability": "reliable", "depth": 5}}))?;
+    robot.says(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String"}))?;
+    robot.says(json!({"op": "publish", "topic": "/name", "msg": {"data": "crowd"}}))?;
+    ensure!(robot.hears_on("/greeting")?["text"] == "Hello, crowd");
+    robot.says(
+        json!({"op": "send_action_goal", "id": "goal", "action": "/count",
+        "action_type": "herald_msgs/action/Count", "args": {"to": 3}, "feedback": true}),
+    )?;
+    for at in 1..=3 {
+        let told = robot.hears("feedback", |told| told["op"] == "action_feedback")?;
+        ensure!(told["values"]["at"] == at, "{told}");
+    }
+    let told = robot.hears("a result", |told| told["op"] == "action_result")?;
+    ensure!(
+        told["values"]["counted"] == json!([1, 2, 3]) && told["result"] == true,
+        "{told}"
+    );
+    robot.leaves()
+}
+
+/// The definition of the herald's action.
+fn count() -> anyhow::Result<Arc<ActionDef>> {
+    let registry = Registry::of(RosVersion::Two);
+    let text = "uint32 to\n---\nuint32[] counted\n---\nuint32 at\n";
+    registry.insert("herald_msgs/action/Count", text)?;
+    Ok(registry.action("herald_msgs/action/Count")?)
+}
+
+/// What came of a goal.
+#[derive(Default)]
+struct Events {
+    feedback: Mutex<usize>,
+    end: Mutex<Option<Result<GoalEnd, String>>>,
+    ended: Notify,
+}
+
+impl GoalEvents for Events {
+    fn feedback(&self, _feedback: Bytes) {
+        *self.feedback.lock() += 1;
+    }
+
+    fn ended(&self, end: Result<GoalEnd, String>) {
+        *self.end.lock() = Some(end);
+        self.ended.notify_one();
+    }
+}
+
+/// Sends the herald a goal; checks that it was counted up to there.
+fn counts(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
+    let events = Arc::new(Events::default());
+    let heard = Arc::clone(&events);
+    let _runtime = site.runtime.enter();
+    let client = app.action_client(action, &count()?)?;
+    let goal = Layout::of(RosVersion::Two).u32(to).finish();
+    client.send("goal", goal, events);
+    site.runtime.block_on(async {
+        let ended = tokio::time::timeout(PATIENCE, heard.ended.notified());
+        ended.await.context("a result should come")
+    })?;
+    let end = heard.end.lock().take().context("an end")?;
+    let end = end.map_err(anyhow::Error::msg)?;
+    let mut expected = Layout::of(RosVersion::Two);
+    expected.u32(to);
+    for number in 1..=to {
+        expected.u32(number);
+    }
+    ensure!(
+        end.outcome == Outcome::Succeeded && end.result == expected.finish(),
+        "{end:?}"
+    );
+    ensure!(*heard.feedback.lock() == to as usize);
+    Ok(())
+}
+
+pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
+    let daemon = world().with(HERALD)?;
+    let site = Site::of(RosVersion::Two)?;
+    let app = site.joins("/app")?;
+    let argv = [
+        "--ros-args",
+        "-r",
+        "__node:=crier",
+        "-r",
+        "__ns:=/front",
+        "-r",
+        "name:=/who",
+        "-p",
+        "salutation:=Good day",
+    ];
+    let mut stub = site.stub(&daemon, THE_HERALD, "ros2-herald", &argv)?;
+    with_log(
+        site.until(&app, "the service", serves("/front/greet")),
+        &stub,
+    )?;
+    // A topic in, remapped; a topic out; both with the original's names and types.
+    let names = site.says(&app, "/who", false)?;
+    let mut greetings = site.hears(&app, "/front/greeting")?;
+    site.connected(&*names, 1)?;
+    site.fed(&greetings, 1)?;
+    names.publish(string_of(WireFormat::Cdr, "robot"));
+    let greeting = with_log(site.next(&mut greetings), &stub)?;
+    ensure!(contains(&greeting.bytes, "Good day, robot"), "{greeting:?}");
+    ensure!(
+        greeting.wire_type.name == "herald_msgs/msg/Greeting"
+            && greeting.publisher.node() == "/front/crier",
+        "{greeting:?}"
+    );
+    // A service and a parameter, which are the node's in the cloud.
+    let run = |future| site.runtime.block_on(future);
+    let parameters = app.node_parameters()?;
+    let asked = ["salutation".to_owned()];
+    let held = run(parameters.get("/front/crier", &asked))?;
+    ensure!(
+        held == [Some(ParamValue::String("Good day".into()))],
+        "{held:?}"
+    );
+    let change = (
+        "salutation".to_owned(),
+        Some(ParamValue::String("Hi".into())),
+    );
+    let set = site
+        .runtime
+        .block_on(parameters.set("/front/crier", vec![change]))?;
+    ensure!(set == [Ok(())], "{set:?}");
+    let request = Layout::of(RosVersion::Two).text("lab").finish();
+    let greeted = site.calls(&app, "/front/greet", &request)?;
+    ensure!(contains(&greeted, "Hi, lab"), "{greeted:?}");
+    with_log(counts(&site, &*app, "/front/count", 4), &stub)?;
+    // ros2 launch's way to end it.
+    stub.signal(Signal::SIGINT)?;
+    let status = stub.ends()?;
+    ensure!(status.code() == Some(0), "{status}: {}", stub.said());
+    site.until(&app, "an empty graph", |graph| {
+        !graph.nodes.contains_key("/front/crier")
+    })?;
+    Ok(())
+}
+
+/// Waits until a node has what is wanted; all that it has then.
+fn ends_of(
+    site: &Site,
+    watcher: &Arc<dyn Bus>,
+    node: &str,
+    wanted: impl Fn(&NodeEnds) -> bool,
+) -> anyhow::Result<NodeEnds> {
+    let graph = site.until(watcher, "the node's ends", |graph| {
+        graph.ends.get(node).is_some_and(&wanted)
+    })?;
+    let mut ends = graph.ends[node].clone();
+    // How many messages are kept is each end's own affair, of which peers need not tell.
+    for (_, qos) in ends
+        .publishers
+        .values_mut()
+        .chain(ends.subscribers.values_mut())
+    {
+        qos.depth = 0;
+    }
+    Ok(ends)
+}
+
+pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
+    let daemon = world().with(HERALD)?;
+    let node = "/herald";
+    let original = {
+        let site = Site::of(RosVersion::Two)?;
+        let program = "/opt/cloudroid/install/lib/herald/herald";
+        let prefix = site.installs_original(&daemon, "herald", ("herald", "herald"), program)?;
+        let _original = site.runs(&prefix, "herald", "herald", &[])?;
+        let watcher = site.joins("/watcher")?;
+        // The last that it makes are the parts of its action.
+        ends_of(&site, &watcher, node, |ends| {
+            ends.publishers.contains_key("/count/_action/status")
+                && ends.services.contains_key("/count/_action/get_result")
+                && ends.services.contains_key("/herald/get_parameters")
+        })?
+    };
+    let site = Site::of(RosVersion::Two)?;
+    let stub = site.stub(&daemon, THE_HERALD, "ros2-graph", &[])?;
+    let watcher = site.joins("/watcher")?;
+    let linked = ends_of(&site, &watcher, node, |ends| {
+        ends.publishers.len() >= original.publishers.len()
+            && ends.subscribers.len() >= original.subscribers.len()
+            && ends.services.len() >= original.services.len()
+    });
+    let linked = with_log(linked, &stub)?;
+    ensure!(
+        linked.publishers == original.publishers
+            && linked.subscribers == original.subscribers
+            && linked.services == original.services,
+        "the original has {original:#?}, the stub {linked:#?}"
+    );
+    Ok(())
+}
+
+pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
+    let daemon = world().with(SEER)?;
+    let site = Site::of(RosVersion::Two)?;
+    let cable = Cable::new(&daemon.address)?;
+    let stub = people::installed_stub(
+        &site,
+        &daemon,
+        &cable,
+        (SEER.name, "ros2-rclpy"),
+        "local = \"none\"",
+    )?;
+    let mut command = Command::new(binaries::ros2().join("bin/python"));
+    command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
+    site.system.is_of(&mut command);
+    let told = with_log(run(&mut command)?.succeeded(), &stub)?;
+    let told: Value = serde_json::from_str(&told.stdout).context(told.stdout.clone())?;
+    for number in 1..=3 {
+        let left = f64::from(5 * number);
+        let corners = json!([[left, 10.0], [left + 7.0, 19.0]]);
+        ensure!(told["answers"][number.to_string()] == corners, "{told:#}");
+    }
+    ensure!(
+        told["before"] == false && told["accepted"] == true,
+        "{told:#}"
+    );
+    let image = json!(["sensor_msgs/msg/Image"]);
+    ensure!(told["subscribes"]["/image"] == image, "{told:#}");
+    // As the original asks for pictures.
+    ensure!(told["reliable"] == json!(["BEST_EFFORT"]), "{told:#}");
+    let found = json!(["geometry_msgs/msg/PolygonStamped"]);
+    ensure!(
+        told["publishes"]["/people_detect/found"] == found,
+        "{told:#}"
+    );
+    Ok(())
+}
+
+pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
+    let setup = world().own("ros2-restarted");
+    let daemon = setup.start()?;
+    let push = daemon.deployer().pushes("herald_ros2", HERALD.arguments)?;
+    push.succeeded()?;
+    let address = daemon.address.clone();
+    let site = Site::of(RosVersion::Two)?;
+    let app = site.joins("/app")?;
+    let stub = site.stub(&daemon, THE_HERALD, "ros2-again", &[])?;
+    with_log(site.until(&app, "the service", serves("/greet")), &stub)?;
+    let request = Layout::of(RosVersion::Two).text("lab").finish();
+    // The last byte tells whether this name was greeted before.
+    let first = with_log(site.calls(&app, "/greet", &request), &stub)?;
+    ensure!(first.last() == Some(&0), "{first:?}");
+    let before = app.graph().borrow().ends.get("/herald").cloned();
+    daemon.is_killed()?;
+    let daemon = setup.listen(&address).start()?;
+    // A call made meanwhile is answered, or forgotten, of which DDS has no way to tell its caller; the next one is answered.
+    let meanwhile = app.call("/greet", request.clone(), MEANWHILE);
+    match site.runtime.block_on(meanwhile) {
+        Ok(_) | Err(BusError::Timeout { .. }) => {}
+        Err(other) => return Err(other.into()),
+    }
+    let again = with_log(site.calls(&app, "/greet", &request), &stub)?;
+    ensure!(
+        again.last() == Some(&1),
+        "it has forgotten what it did: {again:?}\n{}",
+        stub.said()
+    );
+    ensure!(app.graph().borrow().ends.get("/herald").cloned() == before);
+    drop(stub);
+    daemon.deployer().types(&["stop", "--all"])?;
+    daemon.ends()?;
+    Ok(())
+}
+
+pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
+    let daemon = world().with(HERALD)?;
+    world().with(ADDER)?;
+    for (ros, (service, package, executable), words) in [
+        (RosVersion::One, THE_HERALD, ["herald", "ROS 2"]),
+        (
+            RosVersion::Two,
+            ("adder_py", "adder_py", "adder.py"),
+            ["adder_py", "ROS 1"],
+        ),
+    ] {
+        let site = Site::of(ros)?;
+        let toml = format!(
+            "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"ros2-other\"\nlocal = \"none\"\n",
+            daemon.address
+        );
+        let mut stub = site.stub_with(&toml, package, executable, &[])?;
+        let status = stub.ends()?;
+        let said = stub.said();
+        ensure!(
+            status.code() == Some(1) && words.iter().all(|word| said.contains(word)),
+            "{status}\n{said}"
+        );
+    }
+    Ok(())
+}
