@@ -13,12 +13,13 @@ use ros::bus::{
     ServiceType, Subscription, WireType, reaches,
 };
 use ros::net::HostSockets;
-use ros::schema::{ActionDef, Registry};
+use ros::schema::ActionDef;
 use serde_json::json;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use crate::message::{self, TEXT};
 use crate::roles::{PATIENCE, WARM, quantiles, say, until_asked};
+use crate::types;
 
 /// As rclpy's nodes have it that these roles meet.
 const QUALITY: Qos = Qos::keep_last(10);
@@ -45,18 +46,11 @@ struct Types {
 
 impl Types {
     fn new() -> Result<Self> {
-        let known = Registry::of(RosVersion::Two);
-        known.insert("std_msgs/msg/String", "string data\n")?;
-        known.insert(
-            "std_srvs/srv/SetBool",
-            "bool data\n---\nbool success\nstring message\n",
-        )?;
-        let goal = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
-        known.insert("test_msgs/action/Fibonacci", goal)?;
+        let known = types::registry()?;
         Ok(Self {
-            string: WireType::of(&*known.message("std_msgs/String")?),
-            call: ServiceType::of(&*known.service("std_srvs/SetBool")?),
-            goal: known.action("test_msgs/Fibonacci")?,
+            string: WireType::of(&*known.message(types::STRING)?),
+            call: ServiceType::of(&*known.service(types::CALL)?),
+            goal: known.action(types::GOAL)?,
         })
     }
 }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use rtps::Sample;
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::sync::mpsc::UnboundedReceiver;
 
 use crate::ends::{join, matched, quality, reads, writes};
@@ -16,7 +16,7 @@ const PICTURES: (&str, &str) = ("rt/pictures", IMAGE);
 /// As often each second.
 pub(crate) const RATE: f64 = 30.0;
 /// Both sides know of each other after that.
-const SETTLED: Duration = Duration::from_millis(500);
+pub(crate) const SETTLED: Duration = Duration::from_millis(500);
 
 /// `sends WIDTH HEIGHT FRAMES RELIABLE`: what it took of the processor, and how many frames were late.
 pub(crate) async fn sends(words: &[&str]) -> Result<()> {
@@ -63,19 +63,17 @@ pub(crate) async fn takes(words: &[&str]) -> Result<()> {
         asked = until_asked() => drop(asked?),
     }
     let spent = (this.processor("")? - before).as_secs_f64() * 1e3;
-    let milliseconds = |share| {
-        let age = bench_report::quantile(&seen.ages, share);
-        age.map_or(f64::NAN, |age| age.as_secs_f64() * 1e3)
-    };
-    say(&json!({
-        "came": seen.came, "reordered": seen.reordered, "processor": spent,
-        "p50": milliseconds(0.5), "p99": milliseconds(0.99), "peak": this.peak()?, "after": this.resident()?,
-    }));
+    let mut told = seen.told();
+    told["processor"] = spent.into();
+    told["peak"] = this.peak()?.into();
+    told["after"] = this.resident()?.into();
+    say(&told);
     Ok(())
 }
 
+/// What has come.
 #[derive(Default)]
-struct Seen {
+pub(crate) struct Seen {
     came: u32,
     reordered: u32,
     last: Option<u32>,
@@ -91,7 +89,19 @@ impl Seen {
         }
     }
 
-    fn take(&mut self, payload: &[u8]) -> Option<()> {
+    /// As an answer to whoever asks.
+    pub(crate) fn told(&self) -> Value {
+        let milliseconds = |share| {
+            let age = bench_report::quantile(&self.ages, share);
+            age.map_or(f64::NAN, |age| age.as_secs_f64() * 1e3)
+        };
+        json!({
+            "came": self.came, "reordered": self.reordered, "p50": milliseconds(0.5), "p99": milliseconds(0.99),
+        })
+    }
+
+    /// Counts a picture; none where it is no picture.
+    pub(crate) fn take(&mut self, payload: &[u8]) -> Option<()> {
         let (number, age) = message::of_picture(payload)?;
         self.came += 1;
         self.reordered += u32::from(self.last.is_some_and(|last| number <= last));

@@ -77,33 +77,47 @@ fn one(report: &mut Report) -> Result<()> {
     Ok(())
 }
 
+/// What a crowd is of, as its role and as figures call it.
+const CROWDS: [(&str, &str, &str); 2] = [
+    (
+        "participants",
+        "participants",
+        "each in a namespace with a node of our making",
+    ),
+    (
+        "servants",
+        "servants, each with bus, bridge and a robot's session",
+        "each in a namespace with a node of our making; the robots' ends of the sessions are in the same process, and not in the time",
+    ),
+];
+
 fn many(report: &mut Report) -> Result<()> {
     let (count, seconds) = (50, if crate::full() { 120 } else { 30 });
-    eprintln!("{count} participants at rest, for {seconds} s");
-    let world = World::new()?;
-    let mut crowd = world.ours(&["crowd", &count.to_string(), &seconds.to_string()])?;
-    let found = crowd.answer_within(Duration::from_secs(seconds + 60))?;
-    report
-        .figure(
-            format!("each of {count} participants at rest"),
-            "% of a core",
-            number(&found, "share")?,
-        )
-        .reach(Target::AtMost(IDLE))
-        .note(format!(
-            "over {seconds} s, each in a namespace with a node of our making"
-        ));
-    report
-        .figure(
-            format!("memory of each of {count} participants"),
-            "MB",
-            number(&found, "memory")?,
-        )
-        .reach(Target::AtMost(MEMORY))
-        .note(format!(
-            "resident; {:.1} descriptors each, {} threads in all",
-            number(&found, "descriptors")?,
-            number(&found, "threads")?
-        ));
+    for (role, what, note) in CROWDS {
+        eprintln!("{count} {role} at rest, for {seconds} s");
+        let world = World::new()?;
+        let mut crowd = world.ours(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
+        let found = crowd.answer_within(Duration::from_secs(seconds + 60))?;
+        report
+            .figure(
+                format!("each of {count} {what}, at rest"),
+                "% of a core",
+                number(&found, "share")?,
+            )
+            .reach(Target::AtMost(IDLE))
+            .note(format!("over {seconds} s, {note}"));
+        report
+            .figure(
+                format!("memory of each of {count} {what}"),
+                "MB",
+                number(&found, "memory")?,
+            )
+            .reach(Target::AtMost(MEMORY))
+            .note(format!(
+                "resident; {:.1} descriptors each, {} threads in all",
+                number(&found, "descriptors")?,
+                number(&found, "threads")?
+            ));
+    }
     Ok(())
 }

@@ -1,13 +1,15 @@
-//! Pictures at 30 Hz between ours and a node of rclpy with the buffers it comes with, in both directions and both reliabilities.
+//! Pictures at 30 Hz between ours and a node of rclpy with the buffers it comes with, in both directions and both reliabilities; and between that
+//! node and a robot of the portal.
 
 use std::fmt;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use bench_report::{Report, Target};
 use serde_json::Value;
 
 use crate::camera::{self, RATE};
 use crate::message::Size;
+use crate::process::Process;
 use crate::world::{Program, Transport, World, number};
 
 /// Whose camera, and whose eye.
@@ -15,6 +17,10 @@ use crate::world::{Program, Transport, World, number};
 enum Way {
     In,
     Out,
+    /// From a node to a robot.
+    ToRobot,
+    /// From a robot to a node.
+    FromRobot,
     Rclpy(Transport),
 }
 
@@ -23,6 +29,8 @@ impl fmt::Display for Way {
         out.write_str(match self {
             Self::In => "rclpy to ours",
             Self::Out => "ours to rclpy",
+            Self::ToRobot => "rclpy through the portal to a robot",
+            Self::FromRobot => "robot through the portal to rclpy",
             Self::Rclpy(Transport::Stock) => "rclpy to rclpy by shared memory",
             Self::Rclpy(Transport::Udp) => "rclpy to rclpy by UDP",
         })
@@ -34,6 +42,18 @@ struct Found {
     sent: u32,
     sender: Value,
     taker: Value,
+    /// What was between both.
+    portal: Option<Portal>,
+}
+
+/// A portal when pictures have passed it.
+struct Portal {
+    /// What it took of a processor, in milliseconds.
+    processor: f64,
+    /// The peak of its memory.
+    peak: f64,
+    /// Pictures that it left out for a client or a node that was slow.
+    dropped: Value,
 }
 
 impl Found {
@@ -41,10 +61,23 @@ impl Found {
         Ok(f64::from(self.sent) - number(&self.taker, "came")?)
     }
 
-    /// Milliseconds of a processor for a frame, of the sender and of the taker.
+    /// Milliseconds of a processor for a frame, of the sender and of the taker; of the portal instead of its robot.
     fn processor(&self) -> Result<[f64; 2]> {
-        let of = |side| anyhow::Ok(number(side, "processor")? / f64::from(self.sent));
-        Ok([of(&self.sender)?, of(&self.taker)?])
+        let of = |side: &Value| match (&side["processor"], &self.portal) {
+            (Value::Null, Some(portal)) => anyhow::Ok(portal.processor),
+            _ => number(side, "processor"),
+        };
+        let each = |side| anyhow::Ok(of(side)? / f64::from(self.sent));
+        Ok([each(&self.sender)?, each(&self.taker)?])
+    }
+
+    /// The peak of our process's memory, if one was there.
+    fn peak(&self) -> Option<f64> {
+        let of = |side: &Value| side["peak"].as_f64();
+        let portal = self.portal.as_ref().map(|portal| portal.peak);
+        portal
+            .or_else(|| of(&self.sender))
+            .or_else(|| of(&self.taker))
     }
 
     /// Whether so much came that what it took can be compared.
@@ -61,30 +94,60 @@ fn run(way: Way, size: Size, reliable: bool, seconds: u32) -> Result<Found> {
     let world = World::new()?;
     let of_rclpy = match way {
         Way::Rclpy(transport) => transport,
-        Way::In | Way::Out => Transport::Stock,
+        _ => Transport::Stock,
     };
+    let mut portal = match way {
+        Way::ToRobot | Way::FromRobot => Some(world.ours(&["portal", "kept"])?),
+        _ => None,
+    };
+    let as_client = |words: &[&str]| world.ours(&[&["client"], words].concat());
     let mut taker: Program = match way {
         Way::In => world.ours(&taking)?,
-        Way::Out | Way::Rclpy(_) => world.rclpy(of_rclpy, &taking)?,
+        Way::ToRobot => as_client(&taking)?,
+        Way::Out | Way::FromRobot | Way::Rclpy(_) => world.rclpy(of_rclpy, &taking)?,
     };
+    let process = portal.as_ref().map(|portal| Process::of(portal.pid()));
+    let before = process.as_ref().map(Process::processor_in_all);
     let mut sender: Program = match way {
         Way::Out => world.ours(&sending)?,
-        Way::In | Way::Rclpy(_) => world.rclpy(of_rclpy, &sending)?,
+        Way::FromRobot => as_client(&sending)?,
+        Way::In | Way::ToRobot | Way::Rclpy(_) => world.rclpy(of_rclpy, &sending)?,
     };
     let told = sender.answer_within(camera::patience(frames))?;
+    let portal = match (&mut portal, process, before) {
+        (Some(program), Some(process), Some(before)) => Some(Portal {
+            processor: (process.processor_in_all()? - before?).as_secs_f64() * 1e3,
+            peak: process.peak()?,
+            dropped: program.tell()?["dropped"].take(),
+        }),
+        _ => None,
+    };
     Ok(Found {
         sent: frames,
         sender: told,
         taker: taker.tell()?,
+        portal,
     })
+}
+
+/// Seconds of what must not be lost, and of the rest.
+fn lengths() -> Result<(u32, u32)> {
+    let brief = if crate::full() { 60 } else { 20 };
+    match std::env::var("CLOUDROID_BENCH_SECONDS") {
+        Ok(all) => all
+            .parse()
+            .map(|all| (all, all))
+            .context("CLOUDROID_BENCH_SECONDS is no number of seconds"),
+        Err(_) => Ok((60, brief)),
+    }
 }
 
 /// What must not be lost is watched for a minute.
 pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let brief = if crate::full() { 60 } else { 20 };
+    let (long, brief) = lengths()?;
     for size in [Size::SMALL, Size::LARGE] {
         for reliable in [true, false] {
-            let seconds = if reliable { 60 } else { brief };
+            let seconds = if reliable { long } else { brief };
             let quality = if reliable { "reliable" } else { "best effort" };
             let what = format!(
                 "{:.1} MB pictures, {quality}",
@@ -96,7 +159,10 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
                 eprintln!("{what}, {peer}: {brief} s");
                 floors.push((peer, run(peer, size, reliable, brief)?));
             }
-            for way in [Way::Out, Way::In] {
+            let robots = [Way::FromRobot, Way::ToRobot]
+                .into_iter()
+                .filter(|_| reliable);
+            for way in [Way::Out, Way::In].into_iter().chain(robots) {
                 eprintln!("{what}, {way}: {seconds} s");
                 let found = run(way, size, reliable, seconds)?;
                 tell(report, &format!("{what}, {way}"), &found, &floors)?;
@@ -114,6 +180,13 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
     if let Some(overflows) = found.taker["overflows"].as_u64() {
         note += &format!("; {overflows} datagrams found the buffer full");
     }
+    let portal = match &found.portal {
+        Some(portal) => {
+            note += &format!("; the portal left out {}", portal.dropped);
+            ", the portal in its robot's place"
+        }
+        None => "",
+    };
     for (peer, floor) in floors {
         note += &format!("; {peer} lost {} of {}", floor.lost()?, floor.sent);
     }
@@ -141,7 +214,7 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
             )
             .beside(peer.to_string(), sends + takes)
             .note(format!(
-                "sender {sender:.2} and taker {taker:.2}; {sends:.2} and {takes:.2}"
+                "sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"
             ));
         report
             .figure(
@@ -152,10 +225,7 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
             .beside(peer.to_string(), number(&floor.taker, "p50")?)
             .note(format!("p99 {:.1}", number(&found.taker, "p99")?));
     }
-    let ours = [&found.sender, &found.taker]
-        .into_iter()
-        .find_map(|side| side["peak"].as_f64());
-    if let Some(peak) = ours {
+    if let Some(peak) = found.peak() {
         report
             .figure(format!("{what}: memory of ours, at its peak"), "MB", peak)
             .note("resident, of the whole process");

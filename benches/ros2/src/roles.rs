@@ -14,7 +14,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use crate::ends::{hears, join, matched, reads, writes};
 use crate::message::{self, REQUEST, RESPONSE, STRING, TEXT};
 use crate::process::Process;
-use crate::{bus, camera, crowd};
+use crate::{bus, camera, client, crowd, hop, portal};
 
 const PING: (&str, &str) = ("rt/ping", STRING);
 const PONG: (&str, &str) = ("rt/pong", STRING);
@@ -22,7 +22,9 @@ const BEAT: (&str, &str) = ("rt/beat", STRING);
 const ASKED: (&str, &str) = ("rq/setboolRequest", REQUEST);
 const ANSWERED: (&str, &str) = ("rr/setboolReply", RESPONSE);
 /// Where datagrams alone are echoed.
-const ECHO: &str = "127.0.0.1:20000";
+pub(crate) const ECHO: &str = "127.0.0.1:20000";
+/// One as long as a String with what RTPS puts around it.
+pub(crate) const DATAGRAM: [u8; 128] = [7; 128];
 /// An answer that takes longer does not come.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(2);
 /// The first of so many do not count.
@@ -38,7 +40,13 @@ pub(crate) fn play(words: &[&str]) -> Result<()> {
     match words {
         ["datagrams"] => return datagrams(),
         ["datagram-trips", count] => return datagram_trips(count.parse()?),
-        ["crowd", count, seconds] => return crowd::play(count.parse()?, seconds.parse()?),
+        ["hop"] => return hop::serve(),
+        ["hop-trips", count] => return hop::trips(count.parse()?),
+        ["crowd", what, count, seconds] => {
+            return crowd::play(what, count.parse()?, seconds.parse()?);
+        }
+        ["portal", rest @ ..] => return portal::play(rest),
+        ["client", rest @ ..] => return client::play(rest),
         _ => {}
     }
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -241,17 +249,16 @@ fn datagrams() -> Result<()> {
     }
 }
 
-/// Datagrams as long as a String with what RTPS puts around it, one at a time.
+/// [`DATAGRAM`]s there and back, one at a time.
 fn datagram_trips(count: usize) -> Result<()> {
     let socket = UdpSocket::bind("127.0.0.1:0")?;
     socket.connect(ECHO)?;
     socket.set_read_timeout(Some(PATIENCE))?;
     say(&json!({}));
-    let datagram = [7; 128];
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
-        socket.send(&datagram)?;
+        socket.send(&DATAGRAM)?;
         socket.recv(&mut [0; 2048])?;
         if number >= WARM {
             times.push(begun.elapsed());

@@ -12,7 +12,7 @@ use serde_json::Value;
 /// What holds the namespaces; it ends when its standard input does, so that none outlives this program.
 const HOLD: &str = "ip link set lo up && mount -t tmpfs none /dev/shm && echo '{}' && exec cat";
 /// Where rclpy is.
-const PREFIX: &str = "CLOUDROID_ROS2_PREFIX";
+pub(crate) const PREFIX: &str = "CLOUDROID_ROS2_PREFIX";
 /// Most that is asked for takes milliseconds; what takes longer says how long.
 const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -36,7 +36,8 @@ impl World {
         Program::start(holder, "a network namespace").map(Self)
     }
 
-    fn inside(&self) -> Command {
+    /// What a program's words are added to that is to run there.
+    pub(crate) fn inside(&self) -> Command {
         let mut command = Command::new("nsenter");
         for (option, file) in [("net", "net"), ("mount", "mnt")] {
             command.arg(format!("--{option}=/proc/{}/ns/{file}", self.0.pid()));
@@ -73,12 +74,15 @@ impl World {
     }
 }
 
-/// The Python that has rclpy (`scripts/ros2-wheels`).
-pub(crate) fn python() -> Result<PathBuf> {
+/// Where the wheels are (`scripts/ros2-wheels`).
+pub(crate) fn prefix() -> Result<PathBuf> {
     let prefix = std::env::var_os(PREFIX).map(PathBuf::from);
-    let python = prefix
-        .with_context(|| format!("{PREFIX} is not set; make bench sets it"))?
-        .join("bin/python");
+    prefix.with_context(|| format!("{PREFIX} is not set; make bench sets it"))
+}
+
+/// The Python that has rclpy.
+pub(crate) fn python() -> Result<PathBuf> {
+    let python = prefix()?.join("bin/python");
     ensure!(
         python.exists(),
         "{} is missing: run scripts/ros2-wheels",
@@ -116,6 +120,20 @@ impl Program {
         };
         program.answer()?;
         Ok(program)
+    }
+
+    /// A program that says nothing that is for us.
+    pub(crate) fn start_quietly(mut command: Command, name: &str) -> Result<Self> {
+        command.stdin(Stdio::piped()).stdout(Stdio::null());
+        let child = command
+            .spawn()
+            .with_context(|| format!("starting {name}"))?;
+        let (_, lines) = channel();
+        Ok(Self {
+            name: name.to_owned(),
+            child,
+            lines,
+        })
     }
 
     pub(crate) fn pid(&self) -> u32 {

