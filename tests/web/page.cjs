@@ -895,7 +895,7 @@ const STEPS = {
         servant: {
           id: `s${index}`, service: 'adder', revision: 1, robot: `rover${index}`, phase: 'ready', created: Date.now() - 60_000, connections: 1, limits: {},
           cgroup_version: 2, usage: { cpu_usec: 0, memory: random(1e8), pids: 3, oom_kills: 0, throttled_usec: 0 },
-          response: { requests: 100, p50_ms: random(50), p95_ms: random(200) }, pids: [], dropped: 0, down: [], hung: [],
+          response: { requests: 100, p50_ms: random(50), p95_ms: random(200) }, pids: [], dropped: 0, down: [], hung: [], lifecycle: [],
         },
         throttled: random(1), cores: random(1), links: [],
       });
