@@ -2,8 +2,10 @@
 //! `make stories`, as root.
 
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
 use libtest_mimic::{Arguments, Trial};
+use parking_lot::Mutex;
 use ros::bus::RosVersion;
 use support::Verdict;
 
@@ -127,10 +129,8 @@ mod viewers;
 mod warm_pool;
 
 /// A story under its function's name.
-fn story(name: &str, tell: fn() -> Verdict) -> Trial {
-    Trial::test(name, move || {
-        tell().map_err(|error| format!("{error:#}").into())
-    })
+fn story(name: &'static str, tell: fn() -> Verdict) -> Trial {
+    told(name, tell)
 }
 
 /// Names functions once.
@@ -151,10 +151,31 @@ macro_rules! of_both {
 }
 
 /// A story that is told of a robot of this ROS.
-fn of(version: RosVersion, name: &str, tell: fn(RosVersion) -> Verdict) -> Trial {
+fn of(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) -> Trial {
+    told(name, move || tell(version))
+}
+
+/// How long each story took: who makes the tests faster begins with the longest.
+static TOOK: Mutex<Vec<(Duration, &str)>> = Mutex::new(Vec::new());
+/// Of which the longest are printed.
+const LONGEST: usize = 20;
+
+fn told(name: &'static str, tell: impl FnOnce() -> Verdict + Send + 'static) -> Trial {
     Trial::test(name, move || {
-        tell(version).map_err(|error| format!("{error:#}").into())
+        let began = Instant::now();
+        let verdict = tell();
+        TOOK.lock().push((began.elapsed(), name));
+        verdict.map_err(|error| format!("{error:#}").into())
     })
+}
+
+fn print_longest() {
+    let mut took = TOOK.lock();
+    took.sort_unstable_by(|one, other| other.cmp(one));
+    println!("== the longest stories, in seconds");
+    for (time, name) in took.iter().take(LONGEST) {
+        println!("{:8.1}  {name}", time.as_secs_f64());
+    }
 }
 
 fn main() -> ExitCode {
@@ -535,6 +556,9 @@ fn main() -> ExitCode {
     .flatten()
     .collect();
     let conclusion = libtest_mimic::run(&arguments, trials);
+    if !arguments.list {
+        print_longest();
+    }
     let left = support::world::end();
     for thing in &left {
         eprintln!("left behind: {thing}");

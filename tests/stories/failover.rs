@@ -263,16 +263,17 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
         "the local original answers, too why=LinkDown",
         "the cloud answers alone why=LinkUp",
     );
-    let before = (scene.count(over), scene.count(back));
+    let before = scene.count(over);
+    scene.says(back, before)?;
     for round in 1..=2 {
         scene.cable.degrade(SILENT)?;
-        scene.says(over, before.0 + round)?;
+        scene.says(over, before + round)?;
         let number = scene.asks();
         scene.hears(number)?;
         scene.diagnosed(&mut diagnostics, "the link is down")?;
         scene.explains("is down")?;
         scene.cable.restore()?;
-        scene.says(back, before.1 + round)?;
+        scene.says(back, before + round)?;
         let number = scene.asks();
         scene.hears(number)?;
         scene.diagnosed(&mut diagnostics, "the cloud answers")?;
@@ -288,7 +289,7 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
         .daemon
         .api(&format!("/api/v1/history/servants?robot={robot}"))?;
     let periods = history[0]["local"].as_array().context("periods")?;
-    ensure!(periods.len() == 2, "{history:#}");
+    ensure!(periods.len() == before + 2, "{history:#}");
     for period in periods {
         let (began, ended) = (period["began"].as_u64(), period["ended"].as_u64());
         ensure!(
