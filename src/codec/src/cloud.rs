@@ -14,7 +14,7 @@ use crate::layout::{Cloud, Field, Meaning, Number};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::rows::{put_padding, take_padding};
-use crate::wire::{Cursor, put_block};
+use crate::wire::{Cursor, Ends};
 use ratio::Guess;
 
 /// How a column is told.
@@ -24,10 +24,10 @@ const GUESSED: u8 = 2;
 
 /// Appends the body of `message`, which has `layout`.
 pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
-    let (head, rest) = message.split_at(layout.head);
-    let (data, dense) = rest.split_at(rest.len() - 1);
-    put_block(out, head);
-    out.extend_from_slice(dense);
+    let dense = message.len() - layout.tail - 1;
+    let data = &message[layout.head..dense];
+    Ends::around(message, layout.head, layout.tail).put(out);
+    out.push(message[dense]);
     let row = layout.width * layout.point_step;
     put_padding(data, row, layout.row_step, out);
     let mut packed = Vec::new();
@@ -83,18 +83,18 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
 pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let head = input.block()?;
-    let layout = Cloud::read(head, total)
-        .filter(|layout| layout.head == head.len())
+    let ends = input.block()?;
+    let layout = Cloud::read(ends, total)
+        .filter(|layout| layout.head + layout.tail == ends.len())
         .ok_or(Error::Corrupt("a head that is not a cloud's"))?;
-    let dense = input.byte()?;
-    let first = out.len() + head.len();
-    out.extend_from_slice(head);
-    out.resize(first + layout.row_step * layout.height, 0);
+    let length = layout.row_step * layout.height;
+    let data = Ends::of(ends, layout.head).restore(length + 1, out);
+    let (data, dense) = data.split_at_mut(length);
+    dense.copy_from_slice(&[input.byte()?]);
     let row = layout.width * layout.point_step;
-    take_padding(input, &mut out[first..], row, layout.row_step)?;
+    take_padding(input, data, row, layout.row_step)?;
     let mut points = Points {
-        data: &mut out[first..],
+        data,
         layout: &layout,
     };
     for offset in gaps(&layout) {
@@ -140,7 +140,6 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
             }
         }
     }
-    out.push(dense);
     Ok(())
 }
 

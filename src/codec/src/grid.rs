@@ -13,7 +13,7 @@ use crate::generic::{Zstd, unzstd};
 use crate::layout::Grid;
 use crate::padded::Lanes;
 use crate::plane8;
-use crate::wire::{Cursor, put_block};
+use crate::wire::{Cursor, Ends};
 use classes::Classes;
 use ladder::{Ladder, Values};
 
@@ -30,8 +30,8 @@ const LEVELS: [i32; 2] = [1, 3];
 
 /// Appends the body of `message`, which has `layout`, to `out`.
 pub(crate) fn encode(message: &[u8], layout: &Grid, zstd: &mut Zstd, out: &mut Vec<u8>) {
-    let (head, cells) = message.split_at(layout.head);
-    put_block(out, head);
+    let cells = &message[layout.head..message.len() - layout.tail];
+    Ends::around(message, layout.head, layout.tail).put(out);
     let background = background(cells);
     let first = out.len();
     let dear = if classes::shaded(cells, background) {
@@ -85,19 +85,19 @@ fn background(cells: &[u8]) -> u8 {
 
 /// Appends a message of `total` bytes to `out`.
 pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let head = input.block()?;
-    let layout = Grid::read(head, total)
-        .filter(|layout| layout.head == head.len())
+    let ends = input.block()?;
+    let layout = Grid::read(ends, total)
+        .filter(|layout| layout.head + layout.tail == ends.len())
         .ok_or(Error::Corrupt("a head that is not a grid's"))?;
+    let ends = Ends::of(ends, layout.head);
     let mode = input.byte()?;
     let background = input.byte()?;
-    let first = out.len() + head.len();
-    out.extend_from_slice(head);
+    let count = layout.width * layout.height;
     if mode == PACKED {
-        return unzstd(input.take_rest(), layout.width * layout.height, out);
+        return ends.restore_with(out, |out| unzstd(input.take_rest(), count, out));
     }
-    out.resize(first + layout.width * layout.height, background);
-    let cells = &mut out[first..];
+    let cells = ends.restore(count, out);
+    cells.fill(background);
     match mode {
         PLAIN => {
             let rest = input.take_rest();

@@ -9,12 +9,12 @@ use crate::layout::{Image, Pixel};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::rows::{put_padding, take_padding};
-use crate::wire::{Cursor, put_block};
+use crate::wire::{Cursor, Ends};
 
 /// Appends the body of `message`, which has `layout`.
 pub(crate) fn encode(message: &[u8], layout: &Image, out: &mut Vec<u8>) {
-    let (head, data) = message.split_at(layout.head);
-    put_block(out, head);
+    let data = layout.data(message);
+    Ends::around(message, layout.head, layout.tail).put(out);
     put_padding(data, layout.row(), layout.step, out);
     match layout.pixel {
         Pixel::Bytes(channels) => encode_colour(data, layout, channels, out),
@@ -30,14 +30,8 @@ pub(crate) fn encode(message: &[u8], layout: &Image, out: &mut Vec<u8>) {
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
 pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let head = input.block()?;
-    let layout = Image::read(head, total)
-        .filter(|layout| layout.head == head.len())
-        .ok_or(Error::Corrupt("a head that is not an image's"))?;
-    let first = out.len() + head.len();
-    out.extend_from_slice(head);
-    out.resize(first + layout.step * layout.height, 0);
-    let data = &mut out[first..];
+    let (layout, ends) = Image::take(input, total)?;
+    let data = ends.restore(layout.step * layout.height, out);
     take_padding(input, data, layout.row(), layout.step)?;
     match layout.pixel {
         Pixel::Bytes(channels) => decode_colour(input, data, &layout, channels),

@@ -9,7 +9,7 @@ mod guard;
 use crate::Error;
 use crate::layout::{Image, Pixel};
 use crate::rows::{put_alpha, put_padding, take_alpha, take_padding};
-use crate::wire::{Cursor, put_block};
+use crate::wire::{Cursor, Ends};
 use jpeg_encoder::ColorType;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -47,8 +47,8 @@ pub(crate) fn encode(
     out: &mut Vec<u8>,
 ) -> Option<()> {
     let channels = channels(layout)?;
-    let (head, data) = message.split_at(layout.head);
-    put_block(out, head);
+    let data = layout.data(message);
+    Ends::around(message, layout.head, layout.tail).put(out);
     put_padding(data, layout.row(), layout.step, out);
     if channels == 4 {
         put_alpha(data, layout, out);
@@ -79,16 +79,10 @@ pub(crate) fn encode(
 
 /// Appends a message of `total` bytes to `out`.
 pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let head = input.block()?;
-    let layout = Image::read(head, total)
-        .filter(|layout| layout.head == head.len())
-        .ok_or(Error::Corrupt("a head that is not an image's"))?;
+    let (layout, ends) = Image::take(input, total)?;
     let channels = channels(&layout).ok_or(Error::Corrupt("a JPEG of pictures that are none"))?;
     let colours = channels.min(3);
-    let first = out.len() + head.len();
-    out.extend_from_slice(head);
-    out.resize(first + layout.step * layout.height, 0);
-    let data = &mut out[first..];
+    let data = ends.restore(layout.step * layout.height, out);
     take_padding(input, data, layout.row(), layout.step)?;
     if channels == 4 {
         take_alpha(input, data, &layout)?;

@@ -1,13 +1,18 @@
-//! Where things lie in the serialized messages the codecs know, in the ROS 1 wire format (little endian, strings and
-//! arrays preceded by a 32-bit length).
+//! Where things lie in the serialized messages the codecs know: in the ROS 1 wire format (little endian, strings and
+//! arrays preceded by a 32-bit length), and in CDR as ROS 2 has it (see [`Fields`]).
 //!
 //! A layout is read from the *head* of a message, all bytes before its big array, and the message's length. It is
 //! `None` unless every byte of the message is accounted for, so that a codec which accepts a layout can restore the
-//! message from it. The decoder reads the very same layout from the head it was sent.
+//! message from it. The decoder reads the very same layout from the head it was sent; so nobody has to be told which of the two formats a
+//! message is in.
 
-use crate::wire::Cursor;
+mod fields;
 
-/// The message types with a codec of their own, told by name and md5 (the md5 fixes the layout).
+use crate::Error;
+use crate::wire::{Cursor, Ends};
+use fields::{Fields, in_either};
+
+/// The message types with a codec of their own, told by name and md5 or type hash (which fix the layout).
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Hash)]
 pub enum Schema {
     /// `sensor_msgs/Image`
@@ -22,33 +27,51 @@ pub enum Schema {
     Other,
 }
 
+/// By name; the md5 of ROS 1, and the hash (REP-2016) of ROS 2, the same from Iron to Jazzy.
+const KNOWN: [(&str, [&str; 2], Schema); 4] = [
+    (
+        "sensor_msgs/Image",
+        [
+            "060021388200f6f0f447d0fcd9c64743",
+            "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+        ],
+        Schema::Image,
+    ),
+    (
+        "nav_msgs/OccupancyGrid",
+        [
+            "3381f2d731d4076ec5c71b0759edbe4e",
+            "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+        ],
+        Schema::OccupancyGrid,
+    ),
+    (
+        "sensor_msgs/LaserScan",
+        [
+            "90c7ef2dc6895d81024acba2ac42f369",
+            "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
+        ],
+        Schema::LaserScan,
+    ),
+    (
+        "sensor_msgs/PointCloud2",
+        [
+            "1158d486dd51d683ce2f1be655c3c181",
+            "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+        ],
+        Schema::PointCloud2,
+    ),
+];
+
 impl Schema {
-    /// Looks a type up, as named in a publisher's header; a known name with another md5 is `Other`.
-    pub fn of(datatype: &str, md5: &str) -> Self {
-        match (datatype, md5) {
-            ("sensor_msgs/Image", "060021388200f6f0f447d0fcd9c64743") => Self::Image,
-            ("nav_msgs/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e") => Self::OccupancyGrid,
-            ("sensor_msgs/LaserScan", "90c7ef2dc6895d81024acba2ac42f369") => Self::LaserScan,
-            ("sensor_msgs/PointCloud2", "1158d486dd51d683ce2f1be655c3c181") => Self::PointCloud2,
-            _ => Self::Other,
-        }
+    /// Looks a type up, by its name (`pkg/Type` or `pkg/msg/Type`) and its md5 or hash; a known name with another one is `Other`.
+    pub fn of(name: &str, digest: &str) -> Self {
+        let name = name.replacen("/msg/", "/", 1);
+        KNOWN
+            .iter()
+            .find(|(known, digests, _)| *known == name && digests.contains(&digest))
+            .map_or(Self::Other, |&(.., schema)| schema)
     }
-}
-
-/// Skips `std_msgs/Header`.
-fn skip_header(input: &mut Cursor<'_>) -> Option<()> {
-    input.take(12).ok()?;
-    string(input)?;
-    Some(())
-}
-
-fn string<'a>(input: &mut Cursor<'a>) -> Option<&'a [u8]> {
-    let length = input.u32().ok()? as usize;
-    input.take(length).ok()
-}
-
-fn size(input: &mut Cursor<'_>) -> Option<usize> {
-    usize::try_from(input.u32().ok()?).ok()
 }
 
 /// What a picture's samples are.
@@ -97,6 +120,8 @@ impl Pixel {
 pub(crate) struct Image {
     /// Where the data begins.
     pub(crate) head: usize,
+    /// Bytes behind the data, which fill the last word.
+    pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) step: usize,
@@ -110,25 +135,29 @@ pub(crate) struct Image {
 
 impl Image {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        let mut input = Cursor::new(head);
-        skip_header(&mut input)?;
-        let height = size(&mut input)?;
-        let width = size(&mut input)?;
-        let encoding = string(&mut input)?;
+        in_either(head, |input| Self::read_fields(input, total))
+    }
+
+    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
+        input.header()?;
+        let height = input.size()?;
+        let width = input.size()?;
+        let encoding = input.string()?;
         let pixel = Pixel::of(encoding)?;
-        let big_endian = input.byte().ok()? != 0;
-        let step = size(&mut input)?;
-        let data = size(&mut input)?;
-        let head = head.len() - input.remaining();
+        let big_endian = input.byte()? != 0;
+        let step = input.size()?;
+        let data = input.size()?;
+        let head = input.taken();
+        let tail = input.tail(data, total)?;
         let fits = width > 0
             && height > 0
             && width.checked_mul(pixel.bytes())? <= step
-            && step.checked_mul(height)? == data
-            && head.checked_add(data)? == total;
+            && step.checked_mul(height)? == data;
         let red_first = !encoding.starts_with(b"bgr");
         let seen = [&b"mono8"[..], b"rgb8", b"bgr8", b"rgba8", b"bgra8"].contains(&encoding);
         fits.then_some(Self {
             head,
+            tail,
             width,
             height,
             step,
@@ -137,6 +166,23 @@ impl Image {
             red_first,
             seen,
         })
+    }
+
+    /// Reads what a frame tells of an image's ends.
+    pub(crate) fn take<'a>(
+        input: &mut Cursor<'a>,
+        total: usize,
+    ) -> Result<(Self, Ends<'a>), Error> {
+        let ends = input.block()?;
+        let layout = Self::read(ends, total)
+            .filter(|layout| layout.head + layout.tail == ends.len())
+            .ok_or(Error::Corrupt("a head that is not an image's"))?;
+        Ok((layout, Ends::of(ends, layout.head)))
+    }
+
+    /// Its samples, and what is between their rows.
+    pub(crate) fn data<'a>(&self, message: &'a [u8]) -> &'a [u8] {
+        &message[self.head..message.len() - self.tail]
     }
 
     /// Bytes of a row that are samples; the rest of `step` is padding.
@@ -150,28 +196,32 @@ impl Image {
 pub(crate) struct Grid {
     /// Where the cells begin.
     pub(crate) head: usize,
+    /// Bytes behind them, which fill the last word.
+    pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
 }
 
 impl Grid {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        let mut input = Cursor::new(head);
-        skip_header(&mut input)?;
+        in_either(head, |input| Self::read_fields(input, total))
+    }
+
+    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
+        input.header()?;
         // When the map was loaded, and metres per cell.
-        input.take(8 + 4).ok()?;
-        let width = size(&mut input)?;
-        let height = size(&mut input)?;
+        input.words(3)?;
+        let width = input.size()?;
+        let height = input.size()?;
         // Where cell (0, 0) lies.
-        input.take(56).ok()?;
-        let cells = size(&mut input)?;
-        let head = head.len() - input.remaining();
-        let fits = width > 0
-            && height > 0
-            && width.checked_mul(height)? == cells
-            && head.checked_add(cells)? == total;
+        input.doubles(7)?;
+        let cells = input.size()?;
+        let head = input.taken();
+        let tail = input.tail(cells, total)?;
+        let fits = width > 0 && height > 0 && width.checked_mul(height)? == cells;
         fits.then_some(Self {
             head,
+            tail,
             width,
             height,
         })
@@ -190,11 +240,14 @@ pub(crate) struct Scan {
 impl Scan {
     /// The number of intensities follows from the message's length.
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        let mut input = Cursor::new(head);
-        skip_header(&mut input)?;
-        input.take(7 * 4).ok()?;
-        let ranges = size(&mut input)?;
-        let head = head.len() - input.remaining();
+        in_either(head, |input| Self::read_fields(input, total))
+    }
+
+    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
+        input.header()?;
+        input.words(7)?;
+        let ranges = input.size()?;
+        let head = input.taken();
         let rest = total
             .checked_sub(head)?
             .checked_sub(ranges.checked_mul(4)?)?
@@ -259,6 +312,8 @@ pub(crate) struct Field {
 pub(crate) struct Cloud {
     /// Where the data begins.
     pub(crate) head: usize,
+    /// Bytes behind `is_dense`, which fill the last word.
+    pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) point_step: usize,
@@ -272,20 +327,24 @@ const MAX_FIELDS: usize = 64;
 
 impl Cloud {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        let mut input = Cursor::new(head);
-        skip_header(&mut input)?;
-        let height = size(&mut input)?;
-        let width = size(&mut input)?;
-        let count = size(&mut input)?;
+        in_either(head, |input| Self::read_fields(input, total))
+    }
+
+    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
+        input.header()?;
+        let height = input.size()?;
+        let width = input.size()?;
+        let count = input.size()?;
         let mut fields = Vec::new();
         for _ in 0..count {
             Self::read_field(&mut input, &mut fields)?;
         }
-        let big_endian = input.byte().ok()? != 0;
-        let point_step = size(&mut input)?;
-        let row_step = size(&mut input)?;
-        let data = size(&mut input)?;
-        let head = head.len() - input.remaining();
+        let big_endian = input.byte()? != 0;
+        let point_step = input.size()?;
+        let row_step = input.size()?;
+        let data = input.size()?;
+        let head = input.taken();
+        let tail = input.tail(data.checked_add(1)?, total)?;
         fields.sort_by_key(|field| field.offset);
         let apart = fields
             .windows(2)
@@ -300,10 +359,10 @@ impl Cloud {
             && height > 0
             && point_step > 0
             && width.checked_mul(point_step)? <= row_step
-            && row_step.checked_mul(height)? == data
-            && head.checked_add(data)?.checked_add(1)? == total;
+            && row_step.checked_mul(height)? == data;
         fits.then_some(Self {
             head,
+            tail,
             width,
             height,
             point_step,
@@ -312,10 +371,10 @@ impl Cloud {
         })
     }
 
-    fn read_field(input: &mut Cursor<'_>, fields: &mut Vec<Field>) -> Option<()> {
-        let name = string(input)?;
-        let offset = size(input)?;
-        let number = match input.byte().ok()? {
+    fn read_field(input: &mut Fields<'_>, fields: &mut Vec<Field>) -> Option<()> {
+        let name = input.string()?;
+        let offset = input.size()?;
+        let number = match input.byte()? {
             1 | 2 => Number::Byte,
             3 | 4 => Number::Short,
             5 | 6 => Number::Word,
@@ -323,7 +382,7 @@ impl Cloud {
             8 => Number::Double,
             _ => return None,
         };
-        let count = size(input)?;
+        let count = input.size()?;
         let meaning = match (name, number, count) {
             (b"x", Number::Float, 1) => Meaning::X,
             (b"y", Number::Float, 1) => Meaning::Y,
@@ -348,5 +407,24 @@ impl Cloud {
 
     pub(crate) fn points(&self) -> usize {
         self.width * self.height
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_type_is_known_by_its_name_and_what_fixes_its_layout() {
+        let md5 = "060021388200f6f0f447d0fcd9c64743";
+        let hash = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47";
+        assert_eq!(Schema::of("sensor_msgs/Image", md5), Schema::Image);
+        assert_eq!(Schema::of("sensor_msgs/msg/Image", hash), Schema::Image);
+        assert_eq!(Schema::of("sensor_msgs/LaserScan", md5), Schema::Other);
+        assert_eq!(
+            Schema::of("sensor_msgs/msg/Image", &hash[1..]),
+            Schema::Other
+        );
+        assert_eq!(Schema::of("my_msgs/msg/Image", hash), Schema::Other);
     }
 }

@@ -27,6 +27,57 @@ pub(crate) fn unzigzag(value: u64) -> i64 {
     (value >> 1) as i64 ^ -((value & 1) as i64)
 }
 
+/// What stands around a message's big array.
+#[derive(Clone, Copy)]
+pub(crate) struct Ends<'a> {
+    head: &'a [u8],
+    tail: &'a [u8],
+}
+
+impl<'a> Ends<'a> {
+    /// Of both, one after the other; the tail begins at `head`.
+    pub(crate) fn of(both: &'a [u8], head: usize) -> Self {
+        let (head, tail) = both.split_at(head);
+        Self { head, tail }
+    }
+
+    /// The first `head` bytes of `message`, and the last `tail`.
+    pub(crate) fn around(message: &'a [u8], head: usize, tail: usize) -> Self {
+        Self {
+            head: &message[..head],
+            tail: &message[message.len() - tail..],
+        }
+    }
+
+    /// Appends both, preceded by their length.
+    pub(crate) fn put(&self, out: &mut Vec<u8>) {
+        put_varint(out, (self.head.len() + self.tail.len()) as u64);
+        out.extend_from_slice(self.head);
+        out.extend_from_slice(self.tail);
+    }
+
+    /// Appends a message whose array is `data` zeros, which are to be replaced.
+    pub(crate) fn restore<'o>(&self, data: usize, out: &'o mut Vec<u8>) -> &'o mut [u8] {
+        let first = out.len() + self.head.len();
+        out.extend_from_slice(self.head);
+        out.resize(first + data, 0);
+        out.extend_from_slice(self.tail);
+        &mut out[first..first + data]
+    }
+
+    /// Appends a message whose array `write` appends.
+    pub(crate) fn restore_with(
+        &self,
+        out: &mut Vec<u8>,
+        write: impl FnOnce(&mut Vec<u8>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        out.extend_from_slice(self.head);
+        write(out)?;
+        out.extend_from_slice(self.tail);
+        Ok(())
+    }
+}
+
 /// Reads a frame from the front; every step is checked, none allocates.
 #[derive(Clone, Copy)]
 pub(crate) struct Cursor<'a> {

@@ -24,26 +24,68 @@ const SCHEMAS: [Schema; 5] = [
 ];
 const LIMIT: usize = 1 << 22;
 
+/// How a message is serialized.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Ros1,
+    /// Little endian.
+    Cdr,
+}
+
+fn format() -> impl Strategy<Value = Format> {
+    prop::sample::select(vec![Format::Ros1, Format::Cdr])
+}
+
 /// Fields of a ROS message, one after the other.
-#[derive(Default)]
-struct Message(Vec<u8>);
+struct Message {
+    bytes: Vec<u8>,
+    format: Format,
+}
 
 impl Message {
-    fn new() -> Self {
-        Self::default().u32(1).u32(2).u32(3).bytes(b"frame")
+    /// With a header, whose frame has a name of this length.
+    fn new(format: Format, name: usize) -> Self {
+        let first = match format {
+            Format::Ros1 => [1, 0, 0, 0],
+            Format::Cdr => [0, 1, 0, 0],
+        };
+        let bytes = first.to_vec();
+        let name = "f".repeat(name);
+        Self { bytes, format }.u32(2).u32(3).string(&name)
     }
 
     fn raw(mut self, bytes: &[u8]) -> Self {
-        self.0.extend_from_slice(bytes);
+        self.bytes.extend_from_slice(bytes);
+        self
+    }
+
+    fn aligned(mut self, size: usize) -> Self {
+        while self.format == Format::Cdr && (self.bytes.len() - 4) % size != 0 {
+            self.bytes.push(0);
+        }
         self
     }
 
     fn u32(self, value: u32) -> Self {
-        self.raw(&value.to_le_bytes())
+        self.aligned(4).raw(&value.to_le_bytes())
+    }
+
+    fn f64(self, value: f64) -> Self {
+        self.aligned(8).raw(&value.to_le_bytes())
     }
 
     fn bytes(self, bytes: &[u8]) -> Self {
         self.u32(bytes.len() as u32).raw(bytes)
+    }
+
+    fn string(self, text: &str) -> Self {
+        let zero = &b"\0"[..usize::from(self.format == Format::Cdr)];
+        self.bytes(&[text.as_bytes(), zero].concat())
+    }
+
+    /// As it comes over the wire: in whole words.
+    fn whole(self) -> Vec<u8> {
+        self.aligned(4).bytes
     }
 }
 
@@ -88,9 +130,10 @@ fn image() -> impl Strategy<Value = Vec<u8>> {
         any::<bool>(),
         any::<u64>(),
         noise,
+        (format(), 0usize..9),
     )
         .prop_map(
-            |(encoding, width, height, padding, big_endian, seed, noise)| {
+            |(encoding, width, height, padding, big_endian, seed, noise, (format, name))| {
                 let pixel = match encoding {
                     "rgb8" | "bgr8" => 3,
                     "rgba8" | "bgra8" | "32FC1" | "32SC1" => 4,
@@ -100,19 +143,27 @@ fn image() -> impl Strategy<Value = Vec<u8>> {
                     _ => 1,
                 };
                 let step = width * pixel + padding;
-                let message = Message::new()
+                let message = Message::new(format, name)
                     .u32(height as u32)
                     .u32(width as u32)
-                    .bytes(encoding.as_bytes());
+                    .string(encoding);
                 let message = message.raw(&[big_endian.into()]).u32(step as u32);
-                message.bytes(&samples(step * height, seed, noise)).0
+                message.bytes(&samples(step * height, seed, noise)).whole()
             },
         )
 }
 
 fn grid() -> impl Strategy<Value = Vec<u8>> {
-    (1usize..150, 1usize..150, any::<u64>(), 0u32..5, 0u8..5).prop_map(
-        |(width, height, seed, shift, kind)| {
+    let format = (format(), 0usize..9);
+    (
+        1usize..150,
+        1usize..150,
+        any::<u64>(),
+        0u32..5,
+        0u8..5,
+        format,
+    )
+        .prop_map(|(width, height, seed, shift, kind, (format, name))| {
             let cells: Vec<u8> = samples(width * height, seed, if kind == 3 { 0xff } else { 7 })
                 .iter()
                 .map(|&value| match kind {
@@ -123,15 +174,15 @@ fn grid() -> impl Strategy<Value = Vec<u8>> {
                 })
                 .collect();
             let origin = f64::from(shift) * 0.5;
-            let message = Message::new().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
+            let message = Message::new(format, name).u32(0).u32(0);
             let message = message
+                .u32(0.5f32.to_bits())
                 .u32(width as u32)
                 .u32(height as u32)
-                .raw(&origin.to_le_bytes())
+                .f64(origin)
                 .raw(&[0; 48]);
-            message.bytes(&cells).0
-        },
-    )
+            message.bytes(&cells).whole()
+        })
 }
 
 /// Floats of many kinds: measured in millimetres, rough, missing.
@@ -144,7 +195,13 @@ fn float() -> impl Strategy<Value = f32> {
 }
 
 fn scan() -> impl Strategy<Value = Vec<u8>> {
-    (vec(float(), 0..1500), vec(any::<f32>(), 0..1500)).prop_map(|(ranges, intensities)| {
+    let parts = (
+        vec(float(), 0..1500),
+        vec(any::<f32>(), 0..1500),
+        format(),
+        0usize..9,
+    );
+    parts.prop_map(|(ranges, intensities, format, name)| {
         let floats = |message: Message, values: &[f32]| {
             values
                 .iter()
@@ -152,7 +209,8 @@ fn scan() -> impl Strategy<Value = Vec<u8>> {
                     message.raw(&value.to_le_bytes())
                 })
         };
-        floats(floats(Message::new().raw(&[1; 28]), &ranges), &intensities).0
+        let message = Message::new(format, name).aligned(4).raw(&[1; 28]);
+        floats(floats(message, &ranges), &intensities).whole()
     })
 }
 
@@ -167,49 +225,49 @@ fn cloud() -> impl Strategy<Value = Vec<u8>> {
         0usize..5,
         any::<u64>(),
         vec(float(), 1..60),
+        (format(), 0usize..9),
     )
-        .prop_map(|(fields, width, height, tail, padding, seed, floats)| {
-            let mut offset = 0;
-            let mut list = Message::default();
-            let count = fields.len() as u32;
-            let mut float_offsets = Vec::new();
-            for (name, number, gap, count) in fields {
-                offset += gap;
-                list = list
-                    .bytes(name.as_bytes())
-                    .u32(offset as u32)
-                    .raw(&[number])
-                    .u32(count);
-                if number == 7 && count == 1 {
-                    float_offsets.push(offset);
+        .prop_map(
+            |(fields, width, height, tail, padding, seed, floats, (format, name))| {
+                let mut offset = 0;
+                let mut message = Message::new(format, name)
+                    .u32(height as u32)
+                    .u32(width as u32)
+                    .u32(fields.len() as u32);
+                let mut float_offsets = Vec::new();
+                for (name, number, gap, count) in fields {
+                    offset += gap;
+                    message = message
+                        .string(name)
+                        .u32(offset as u32)
+                        .raw(&[number])
+                        .u32(count);
+                    if number == 7 && count == 1 {
+                        float_offsets.push(offset);
+                    }
+                    offset += [0, 1, 1, 2, 2, 4, 4, 4, 8][usize::from(number)] * count as usize;
                 }
-                offset += [0, 1, 1, 2, 2, 4, 4, 4, 8][usize::from(number)] * count as usize;
-            }
-            let step = offset + tail + 1;
-            let row = step * width + padding;
-            let mut data = samples(row * height, seed, 0x0f);
-            for y in 0..height {
-                for x in 0..width {
-                    for (index, &offset) in float_offsets.iter().enumerate() {
-                        let value = floats[(x + y + index) % floats.len()] * (x + 1) as f32;
-                        data[y * row + x * step + offset..][..4]
-                            .copy_from_slice(&value.to_le_bytes());
+                let step = offset + tail + 1;
+                let row = step * width + padding;
+                let mut data = samples(row * height, seed, 0x0f);
+                for y in 0..height {
+                    for x in 0..width {
+                        for (index, &offset) in float_offsets.iter().enumerate() {
+                            let value = floats[(x + y + index) % floats.len()] * (x + 1) as f32;
+                            data[y * row + x * step + offset..][..4]
+                                .copy_from_slice(&value.to_le_bytes());
+                        }
                     }
                 }
-            }
-            let message = Message::new()
-                .u32(height as u32)
-                .u32(width as u32)
-                .u32(count)
-                .raw(&list.0);
-            message
-                .raw(&[0])
-                .u32(step as u32)
-                .u32(row as u32)
-                .bytes(&data)
-                .raw(&[1])
-                .0
-        })
+                message
+                    .raw(&[0])
+                    .u32(step as u32)
+                    .u32(row as u32)
+                    .bytes(&data)
+                    .raw(&[1])
+                    .whole()
+            },
+        )
 }
 
 fn any_message() -> impl Strategy<Value = (Schema, Vec<u8>)> {
@@ -282,6 +340,10 @@ proptest! {
 
 /// A moving scene of 64×48 pixels.
 fn scene(encoding: &str, channels: usize, round: usize) -> Vec<u8> {
+    scene_in(Format::Ros1, encoding, channels, round)
+}
+
+fn scene_in(format: Format, encoding: &str, channels: usize, round: usize) -> Vec<u8> {
     let (width, height, padding) = (64, 48, 5);
     let mut data = Vec::new();
     for y in 0..height {
@@ -296,15 +358,55 @@ fn scene(encoding: &str, channels: usize, round: usize) -> Vec<u8> {
         }
         data.extend_from_slice(&[round as u8; 5]);
     }
-    let message = Message::new()
+    let message = Message::new(format, 5)
         .u32(height as u32)
         .u32(width as u32)
-        .bytes(encoding.as_bytes());
+        .string(encoding);
     message
         .raw(&[0])
         .u32((width * channels + padding) as u32)
         .bytes(&data)
-        .0
+        .whole()
+}
+
+/// Messages as nodes send them have frames of their own codec, in both formats and whatever fills the last word.
+#[test]
+fn each_schema_is_told_by_its_own_codec_in_both_formats() {
+    for format in [Format::Ros1, Format::Cdr] {
+        for length in 0..8 {
+            let message = || Message::new(format, length);
+            let cells = samples(21 * (3 + length), 7, 0);
+            let image = message()
+                .u32(3 + length as u32)
+                .u32(7)
+                .string("rgb8")
+                .raw(&[0])
+                .u32(21)
+                .bytes(&cells);
+            let grid = message().u32(1).u32(2).u32(3).u32(21);
+            let grid = grid.u32(3 + length as u32).f64(1.0).raw(&[0; 48]);
+            let scan = message().aligned(4).raw(&[1; 28]);
+            let scan = scan.u32(64).raw(&samples(256, 3, 0)).u32(0);
+            let field =
+                |message: Message, name, offset| message.string(name).u32(offset).raw(&[7]).u32(1);
+            let cloud = field(field(message().u32(1).u32(32).u32(2), "x", 0), "y", 4);
+            let cloud = cloud.raw(&[0]).u32(8).u32(256).bytes(&samples(256, 5, 0));
+            for (schema, message) in [
+                (Schema::Image, image),
+                (Schema::OccupancyGrid, grid.bytes(&cells)),
+                (Schema::LaserScan, scan),
+                (Schema::PointCloud2, cloud.raw(&[1])),
+            ] {
+                let (message, mut frame) = (message.whole(), Vec::new());
+                let made = Codec::made_for(schema);
+                let encoded = Encoder::new(schema).encode(made, &message, &mut frame);
+                assert_eq!(encoded.codec, made, "{format:?}, {schema:?}, {length}");
+                let mut back = Vec::new();
+                Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
+                assert_eq!(back, message, "{format:?}, {schema:?}, {length}");
+            }
+        }
+    }
 }
 
 #[test]
@@ -350,20 +452,23 @@ fn assert_seen(back: &[u8], message: &[u8], channels: usize, most: u8) {
 
 #[test]
 fn jpeg_keeps_all_but_the_colours_and_each_picture_stands_alone() {
-    for (encoding, channels) in [
-        ("mono8", 1),
-        ("rgb8", 3),
-        ("bgr8", 3),
-        ("rgba8", 4),
-        ("bgra8", 4),
+    for (format, encoding, channels) in [
+        (Format::Ros1, "mono8", 1),
+        (Format::Ros1, "rgb8", 3),
+        (Format::Ros1, "bgr8", 3),
+        (Format::Ros1, "rgba8", 4),
+        (Format::Ros1, "bgra8", 4),
+        (Format::Cdr, "mono8", 1),
+        (Format::Cdr, "bgr8", 3),
+        (Format::Cdr, "rgba8", 4),
     ] {
         let mut before = usize::MAX;
         for (quality, most) in [(95, 30), (80, 60), (30, 120)] {
             let mut encoder = Encoder::new(Schema::Image).allow_jpeg(JpegOptions { quality });
-            let message = scene(encoding, channels, 3);
+            let message = scene_in(format, encoding, channels, 3);
             let mut frame = Vec::new();
             let encoded = encoder.encode(Codec::Jpeg, &message, &mut frame);
-            assert_eq!(encoded.codec, Codec::Jpeg, "{encoding}");
+            assert_eq!(encoded.codec, Codec::Jpeg, "{format:?} {encoding}");
             assert!(frame.len() < before, "a lower quality is smaller");
             before = frame.len();
             let mut back = Vec::new();
@@ -420,11 +525,18 @@ fn a_jpeg_that_is_cut_changed_or_of_another_size_is_refused_or_a_picture() {
 #[cfg(feature = "video")]
 #[test]
 fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
-    for (encoding, channels) in [("rgb8", 3), ("bgr8", 3), ("rgba8", 4), ("bgra8", 4)] {
+    for (format, encoding, channels) in [
+        (Format::Ros1, "rgb8", 3),
+        (Format::Ros1, "bgr8", 3),
+        (Format::Ros1, "rgba8", 4),
+        (Format::Ros1, "bgra8", 4),
+        (Format::Cdr, "rgb8", 3),
+        (Format::Cdr, "bgra8", 4),
+    ] {
         let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
         let mut decoder = Decoder::new(LIMIT);
         for round in 0..12 {
-            let message = scene(encoding, channels, round);
+            let message = scene_in(format, encoding, channels, round);
             let mut frame = Vec::new();
             let encoded = encoder.encode(Codec::Video, &message, &mut frame);
             assert_eq!(encoded.codec, Codec::Video);

@@ -6,7 +6,7 @@ use super::guard;
 use crate::Error;
 use crate::layout::{Image, Pixel};
 use crate::rows::{put_alpha, put_padding, take_alpha, take_padding};
-use crate::wire::{Cursor, put_block, put_varint};
+use crate::wire::{Cursor, Ends, put_varint};
 use openh264::OpenH264API;
 use openh264::decoder::{Decoder, DecoderConfig};
 use openh264::encoder::{
@@ -72,7 +72,7 @@ impl VideoEncoder {
         out: &mut Vec<u8>,
     ) -> Option<()> {
         let order = order(layout)?;
-        let (head, data) = message.split_at(layout.head);
+        let data = layout.data(message);
         let rows = || {
             data.chunks_exact(layout.step)
                 .map(|line| &line[..layout.row()])
@@ -102,7 +102,7 @@ impl VideoEncoder {
             FrameType::IPMixed | FrameType::Skip | FrameType::Invalid => return None,
         };
         self.number += 1;
-        put_block(out, head);
+        Ends::around(message, layout.head, layout.tail).put(out);
         put_padding(data, layout.row(), layout.step, out);
         put_varint(out, self.number);
         out.push(key.into());
@@ -156,15 +156,9 @@ impl VideoDecoder {
         total: usize,
         out: &mut Vec<u8>,
     ) -> Result<(), Error> {
-        let head = input.block()?;
-        let layout = Image::read(head, total)
-            .filter(|layout| layout.head == head.len())
-            .ok_or(Error::Corrupt("a head that is not an image's"))?;
+        let (layout, ends) = Image::take(input, total)?;
         let order = order(&layout).ok_or(Error::Corrupt("a video of pictures that are none"))?;
-        let first = out.len() + head.len();
-        out.extend_from_slice(head);
-        out.resize(first + layout.step * layout.height, 0);
-        let data = &mut out[first..];
+        let data = ends.restore(layout.step * layout.height, out);
         take_padding(input, data, layout.row(), layout.step)?;
         let number = input.varint()?;
         let key = input.byte()? == 1;
