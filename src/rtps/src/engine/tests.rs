@@ -49,6 +49,8 @@ struct World {
     sent: usize,
     /// What receivers take at a time, in bytes; all if none.
     room: Option<usize>,
+    /// Of samples that are not whole yet.
+    budget: budget::Budget,
 }
 
 const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
@@ -71,6 +73,7 @@ impl World {
             loses: Box::new(|_, _| false),
             sent: 0,
             room: None,
+            budget: budget::Budget::new("samples", 1 << 30),
         };
         (0..participants).for_each(|_| world.join());
         world
@@ -93,7 +96,7 @@ impl World {
         };
         let bounds = Bounds {
             max_sample: 16 << 20,
-            budget: budget::Budget::unlimited(),
+            budget: self.budget.clone(),
             unfinished: Duration::from_secs(30),
         };
         let announce_to = (0..4)
@@ -472,6 +475,35 @@ fn whose_port_is_gone_is_dead_at_once() {
     assert_eq!(ends.borrow().matched.len(), 1);
     world.engines[0].ports_bound(now, &bound([7410, 7411]));
     assert_eq!(ends.borrow().matched.len(), 0);
+}
+
+#[test]
+fn a_node_killed_between_two_fragments_leaves_nothing_of_its_sample() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(10));
+    let (_, ends, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    // It sends one datagram of many.
+    let mut sent = 0;
+    world.loses = Box::new(move |_, bytes| {
+        sent += usize::from(bytes[8] == 1);
+        sent > 1
+    });
+    world.write(writer, 1, 500_000);
+    world.carry();
+    assert_ne!(world.budget.used(), 0, "a part has come");
+    let now = world.now;
+    world.engines[1].ports_bound(now, &bound([7412, 7413]));
+    assert_eq!(world.budget.used(), 0);
+    assert_eq!(ends.borrow().matched.len(), 0);
+    // Who takes its place is heard, and nothing of the dead.
+    world.loses = Box::new(|_, bytes| bytes[8] == 1);
+    world.join();
+    let (writer, _) = world.writer(2, keep(10));
+    world.pass(SECOND);
+    world.write(writer, 7, 8);
+    world.pass(SECOND);
+    assert_eq!(read.marks(), [7]);
 }
 
 #[test]
