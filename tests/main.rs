@@ -1,11 +1,12 @@
 //! The whole system, told as stories: each a user's errand from end to end with real parts. Run by
 //! `make stories`, as root.
 
+use std::num::NonZero;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use libtest_mimic::{Arguments, Trial};
-use parking_lot::Mutex;
+use parking_lot::{Mutex, RwLock};
 use ros::bus::RosVersion;
 use support::Verdict;
 
@@ -155,6 +156,13 @@ fn of(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) 
     told(name, move || tell(version))
 }
 
+/// Stories that compare times with each other: told while no other is.
+const ALONE: [&str; 2] = [
+    "calibration::fewer_cores_take_longer_and_rows_say_how_long",
+    "page::a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing",
+];
+static TELLING: RwLock<()> = RwLock::new(());
+
 /// How long each story took: who makes the tests faster begins with the longest.
 static TOOK: Mutex<Vec<(Duration, &str)>> = Mutex::new(Vec::new());
 /// Of which the longest are printed.
@@ -162,8 +170,11 @@ const LONGEST: usize = 20;
 
 fn told(name: &'static str, tell: impl FnOnce() -> Verdict + Send + 'static) -> Trial {
     Trial::test(name, move || {
+        let alone = ALONE.contains(&name).then(|| TELLING.write());
+        let beside = alone.is_none().then(|| TELLING.read());
         let began = Instant::now();
         let verdict = tell();
+        drop((alone, beside));
         TOOK.lock().push((began.elapsed(), name));
         verdict.map_err(|error| format!("{error:#}").into())
     })
@@ -178,8 +189,13 @@ fn print_longest() {
     }
 }
 
+/// Stories told at a time for each core: most of a story is waiting.
+const AT_A_TIME: usize = 2;
+
 fn main() -> ExitCode {
-    let arguments = Arguments::from_args();
+    let mut arguments = Arguments::from_args();
+    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+    arguments.test_threads.get_or_insert(AT_A_TIME * cores);
     // Their programs take minutes to build: make test-cross does, and says so.
     let built = std::env::var("CLOUDROID_CROSS").unwrap_or_default();
     let has = |architecture: &str| built.split_whitespace().any(|one| one == architecture);
@@ -361,6 +377,7 @@ fn main() -> ExitCode {
             the_robot_s_graph_is_the_original_s,
             an_application_of_rclpy_asks_the_cloud,
             a_node_lives_on_when_the_daemon_starts_again,
+            pictures_are_made_smaller_where_the_link_is_slow,
             a_robot_of_the_other_ros_is_refused_by_name,
         ],
         stories![memory:

@@ -15,10 +15,10 @@ use ros::bus::{
 };
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
-use support::cable::Cable;
+use support::cable::{Badness, Cable};
 use support::deployer::run;
 use support::layout::Layout;
-use support::people;
+use support::people::{self, Camera};
 use support::robot::PATIENCE;
 use support::site::{Running, Site, string_of};
 use support::world::{ADDER, HERALD, SEER, world};
@@ -333,6 +333,68 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
     drop(stub);
     daemon.deployer().types(&["stop", "--all"])?;
     daemon.ends()?;
+    Ok(())
+}
+
+/// The pixels of a wall with a shadow on it, which moves, as a camera sees them: with two bits of noise. What knows no pictures does not get them
+/// much smaller.
+fn wall(number: u32, (width, height): (u32, u32)) -> Vec<u8> {
+    let mut noise = number;
+    let mut pixels = Vec::new();
+    for row in 0..height {
+        for column in 0..width {
+            noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let bits = |shift: u32| (noise >> shift & 3) as u8;
+            let shade = (row / 2 + (column + number).abs_diff(width / 2) / 3) as u8;
+            pixels.extend([
+                shade + bits(28),
+                shade / 2 + bits(24),
+                200 - shade / 2 + bits(20),
+            ]);
+        }
+    }
+    pixels
+}
+
+pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
+    const SIZE: (u32, u32) = (320, 240);
+    let daemon = world().with(SEER)?;
+    for (codec, smaller) in [("auto", true), ("none", false)] {
+        let cable = Cable::new(&daemon.address)?;
+        cable.degrade(Badness {
+            rate: 20_000,
+            delay: 5,
+            jitter: 0,
+            loss: 0.0,
+            limit: 10_000,
+        })?;
+        let site = Site::of(RosVersion::Two)?;
+        let robot = format!("ros2-pictures-{codec}");
+        let settings = format!("local = \"none\"\ncodec = \"{codec}\"");
+        let stub = people::stub(&site, &daemon, &cable, (SEER.name, &robot), &settings, &[])?;
+        let mut camera = with_log(Camera::new(&site, 10), &stub)?;
+        // The link has to be measured, and the codecs to be tried, before one is settled on.
+        let mut carried = Vec::new();
+        for number in 1..=40 {
+            let before = cable.carried()?.0;
+            let pixels = wall(number, SIZE);
+            let picture = people::picture_of(RosVersion::Two, number, SIZE, &pixels);
+            camera.image.publish(picture);
+            // The node looks at every pixel, and says where it is bright.
+            let found = with_log(site.next(&mut camera.found), &stub)?;
+            ensure!(people::number(&found) == Some(number), "{found:?}");
+            carried.push(cable.carried()?.0 - before);
+        }
+        let size = u64::from(SIZE.0 * SIZE.1 * 3);
+        let last = &carried[carried.len() - 5..];
+        ensure!(
+            last.iter().all(|bytes| match smaller {
+                true => *bytes < size * 2 / 5,
+                false => *bytes >= size,
+            }),
+            "codec {codec}: pictures of {size} bytes took {carried:?}"
+        );
+    }
     Ok(())
 }
 
