@@ -20,6 +20,7 @@ use crate::install::{self, Addition, Made};
 use crate::key::Key;
 use crate::keys;
 use crate::launch::{self, Ask, LaunchPlan};
+use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
 use crate::workshop::{Layer, Workshop};
 
@@ -39,9 +40,10 @@ pub(crate) struct Build<'a> {
 
 /// What one of them found and made.
 pub(crate) struct Parts {
-    /// ROS packages that the push is about, the one that gives its name first.
+    /// ROS packages that the push is about, most important first.
     pub(crate) packages: Vec<String>,
-    pub(crate) version: String,
+    /// Theirs, as far as they are known.
+    pub(crate) versions: BTreeMap<String, String>,
     pub(crate) dependencies: Made,
     /// Nothing where the dependencies are all.
     pub(crate) package: Made,
@@ -227,7 +229,8 @@ impl Build<'_> {
         for name in flavour.environment("").keys() {
             environment.remove(name);
         }
-        let package = made.packages.first().cloned().unwrap_or_default();
+        let package = pushed::subject(&made.packages, &answer.nodes);
+        let version = made.versions.get(&package).cloned().unwrap_or_default();
         let of = (package.clone(), environment.clone(), answer.nodes.clone());
         let inventory = crate::blocking::reading(move || {
             let (package, environment, nodes) = of;
@@ -252,7 +255,7 @@ impl Build<'_> {
                 ("org.opencontainers.image.title".to_owned(), package.clone()),
                 (
                     "org.opencontainers.image.version".to_owned(),
-                    made.version.clone(),
+                    version.clone(),
                 ),
             ]),
             ..ImageSpec::default()
@@ -263,7 +266,7 @@ impl Build<'_> {
         let _ = fs::remove_file(&self.log);
         Ok(BuildOutcome {
             package,
-            version: made.version,
+            version,
             flavour,
             image,
             layers,

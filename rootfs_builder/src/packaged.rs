@@ -1,6 +1,6 @@
 //! `--apt NAME`: a ROS package that the distribution has compiled already.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
@@ -69,13 +69,15 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
             .map(str::to_owned),
     );
     debs.remove("");
-    let version = version(build, &packages[0]);
+    let versions = packages.iter();
+    let versions = versions.map(|package| (package.clone(), version(build, package)));
+    let versions = versions.collect();
     let dependencies = build
         .add("dependencies", &build.on_base(), &debs, wanted.extras)
         .await?;
     Ok(Parts {
         packages,
-        version,
+        versions,
         dependencies,
         package: Made::default(),
         prefix: None,
@@ -104,8 +106,11 @@ async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
         .add("dependencies", &build.on_base(), &debs, Vec::new())
         .await?;
     Ok(Parts {
+        versions: BTreeMap::from([(
+            plain.clone(),
+            version.map_or_else(String::new, |deb| deb.version),
+        )]),
         packages: vec![plain],
-        version: version.map_or_else(String::new, |deb| deb.version),
         dependencies,
         package: Made::default(),
         prefix: None,

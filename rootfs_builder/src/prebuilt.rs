@@ -1,6 +1,6 @@
 //! An install space that was compiled elsewhere: placed where it was compiled for.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -33,7 +33,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
         ..asked
     };
     let there = Indexed {
-        build: BTreeSet::new(),
+        build: pushed::tools(&asked),
         run: build.indexed(&build.on_base()).await?,
     };
     let resolved = keys::resolve(
@@ -53,7 +53,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
     let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
     Ok(Parts {
         packages,
-        version: pushed::version(&space.packages),
+        versions: pushed::versions(&space.packages),
         dependencies,
         package,
         prefix: Some(prefix),

@@ -1,6 +1,6 @@
 //! What was pushed, as far as a build asks.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 use std::path::Path;
 
@@ -14,6 +14,7 @@ use rustix::fs::FileType;
 use crate::base::Base;
 use crate::error::Error;
 use crate::keys::Needed;
+use crate::launch::LaunchNode;
 
 /// Looks at a pushed tree.
 pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
@@ -74,8 +75,7 @@ pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
         .collect()
 }
 
-/// The package that a push is about, and the others after it: the one that none of the others needs, the last in
-/// the order of building when there are several.
+/// Most important first: the one that none of the others needs, the last in the order of building when there are several.
 pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
     let mut names: Vec<String> = packages
         .iter()
@@ -102,13 +102,26 @@ pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
     names
 }
 
-/// The version of that package.
-pub(crate) fn version(packages: &[Package]) -> String {
-    let first = by_importance(packages).into_iter().next();
-    let package = packages
-        .iter()
-        .find(|package| Some(&package.manifest.name) == first.as_ref());
-    package.map_or_else(String::new, |package| package.manifest.version.clone())
+/// The package that a push is about, which gives its service the name and the stub: of `packages`, most important first, the first of which a program is
+/// run; else the first.
+pub(crate) fn subject(packages: &[String], nodes: &[LaunchNode]) -> String {
+    let runs = |package: &&String| nodes.iter().any(|node| node.package == **package);
+    let first = packages.iter().find(runs).or(packages.first());
+    first.cloned().unwrap_or_default()
+}
+
+/// Versions of packages, by name.
+pub(crate) fn versions(packages: &[Package]) -> BTreeMap<String, String> {
+    let all = packages.iter().map(|package| &package.manifest);
+    all.map(|of| (of.name.clone(), of.version.clone()))
+        .collect()
+}
+
+/// What installed packages name as `<depend>`, and were only compiled with: nothing of it runs.
+pub(crate) fn tools(asked: &Needed) -> BTreeSet<String> {
+    let is_tool =
+        |name: &&String| name.starts_with("ament_cmake") || *name == "rosidl_default_generators";
+    asked.run.keys().filter(is_tool).cloned().collect()
 }
 
 /// Whether anything in a tree is Python that runs: not what only builds (`setup.py`, dynamic_reconfigure's `.cfg`), nor
@@ -183,7 +196,40 @@ mod tests {
             ("aa_msgs", "<depend>std_msgs</depend>"),
         ]);
         assert_eq!(by_importance(pushed.packages()), ["app", "aa_msgs"]);
-        assert_eq!(version(pushed.packages()), "1.2.3");
+        let versions = versions(pushed.packages());
+        assert_eq!(versions["app"], "1.2.3");
+    }
+
+    #[test]
+    fn a_push_is_about_the_package_whose_program_runs() {
+        let packages = ["tools", "app", "driver"].map(str::to_owned);
+        let node = |package: &str| LaunchNode {
+            name: "/it".to_owned(),
+            package: package.to_owned(),
+            executable: "it".to_owned(),
+            argv: Vec::new(),
+            remaps: BTreeMap::new(),
+            environment: BTreeMap::new(),
+            directory: None,
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
+            named: true,
+        };
+        assert_eq!(subject(&packages, &[node("driver"), node("app")]), "app");
+        assert_eq!(subject(&packages, &[node("of_debian")]), "tools");
+        assert_eq!(subject(&[], &[node("app")]), "");
+    }
+
+    #[test]
+    fn what_installed_packages_were_compiled_with_is_a_tool() {
+        let (_root, pushed) = workspace(&[(
+            "app",
+            "<depend>ament_cmake</depend><depend>rosidl_default_generators</depend><depend>rclcpp</depend>",
+        )]);
+        let tools = tools(&asked(pushed.packages()));
+        let tools: Vec<&str> = tools.iter().map(String::as_str).collect();
+        assert_eq!(tools, ["ament_cmake", "rosidl_default_generators"]);
     }
 
     #[test]

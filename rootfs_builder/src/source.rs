@@ -29,9 +29,9 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
         pushed::names(&workspace.packages),
         pushed::asked(&workspace.packages),
     );
-    let (packages, version, python) = (
+    let (packages, versions, python) = (
         pushed::by_importance(&workspace.packages),
-        pushed::version(&workspace.packages),
+        pushed::versions(&workspace.packages),
         pushed::has_python(&workspace.root),
     );
     let tools = toolchain(build).await?;
@@ -59,7 +59,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
     let dependencies = dependencies(build, &resolved, &needed, python).await?;
     Ok(Parts {
         packages,
-        version,
+        versions,
         dependencies,
         package,
         prefix: Some(build.base.build.prefix.clone()),

@@ -18,12 +18,18 @@ use ros::flavour::Flavour;
 use ros::plumbing;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
+use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::Pusher;
 use super::probe::{self, Alive, NODE};
 use crate::Error;
 use store::Plan;
+
+/// A program may be several nodes (ROS 2), which come one after the other: its first by name is the one that it is called by. For so long others are
+/// waited for after one, and after the first.
+const QUIET: Duration = Duration::from_millis(200);
+const MORE_NODES: Duration = Duration::from_secs(2);
 
 /// Parameters that a warning names.
 const NAMED: usize = 12;
@@ -56,7 +62,7 @@ pub(super) async fn settle(
         .map(|index| {
             let mut node = plan.nodes[*index].clone();
             let put = built.flavour.namespace(&namespace(*index));
-            node.argv.extend(put.arguments);
+            built.flavour.put(put.arguments, &mut node.argv);
             node.environment.extend(put.environment);
             node
         })
@@ -99,9 +105,12 @@ async fn look(
         biased;
         // What it says of itself is told when it is started again, with its parameters.
         _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed, host)),
-        there = timeout(patience, graph.wait_for(all_there)) => match there {
-            Ok(Ok(graph)) => Ok(names(&graph, unnamed, host)),
-            Ok(Err(_)) => Err(failed(ProbeError::MasterGone.to_string())),
+        there = timeout(patience, graph.wait_for(all_there)) => match there.map(|there| there.is_ok()) {
+            Ok(true) => {
+                let _ = timeout(MORE_NODES, settled(&mut graph)).await;
+                Ok(names(&seen.borrow(), unnamed, host))
+            }
+            Ok(false) => Err(failed(ProbeError::MasterGone.to_string())),
             // Here it cannot reach what it was granted; it can when it is looked at.
             Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed, host)),
             Err(_) => Err(never_registered(alone, patience)),
@@ -112,6 +121,11 @@ async fn look(
         Ok(names) => Ok(names),
         Err(error) => Err(probe::explained(error, servant).await),
     }
+}
+
+/// Returns when no other nodes have come for a moment.
+async fn settled(graph: &mut watch::Receiver<Arc<Graph>>) {
+    while let Ok(Ok(())) = timeout(QUIET, graph.changed()).await {}
 }
 
 fn never_registered(alone: &Plan, after: Duration) -> Error {
@@ -128,24 +142,25 @@ fn never_registered(alone: &Plan, after: Duration) -> Error {
     }
 }
 
-/// Which node of the graph is which. `host`: the name of the machine that they think they run on.
+/// Which node of the graph is which: its name without namespace, or an absolute one where its program has chosen the namespace itself. `host`: the name
+/// of the machine that they think they run on.
 fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Vec<(usize, String)> {
     let mut names = Vec::new();
     for index in unnamed {
         let below = format!("{}/", namespace(*index));
-        let own = graph
-            .nodes
-            .keys()
-            .find_map(|node| node.strip_prefix(below.as_str()));
+        let own = graph.nodes.keys();
+        let own = own
+            .filter_map(|node| node.strip_prefix(below.as_str()))
+            .min();
         // A program may choose its namespace itself; alone it is known all the same.
         let only = (unnamed.len() == 1)
             .then(|| graph.nodes.keys().find(|node| *node != NODE))
             .flatten();
-        let said = own.or(only.map(|name| name.trim_start_matches('/')));
+        let said = own.or(only.map(String::as_str));
         // What a program registers is untrusted.
         let said = said
             .map(|name| without_host(without_random_end(name), host))
-            .filter(|name| is_graph_name(&format!("/{name}")));
+            .filter(|name| is_graph_name(&format!("/{}", name.trim_start_matches('/'))));
         if let Some(name) = said {
             names.push((*index, name));
         }
@@ -204,7 +219,13 @@ fn apply(
     for index in unnamed {
         let guess = plan.nodes[*index].name.clone();
         let known = found.iter().find(|(of, _)| of == index);
-        let wanted = known.map_or(guess.clone(), |(_, name)| format!("/{name}"));
+        let known = known.map(|(_, name)| name.as_str());
+        let above = guess.rsplit_once('/').map_or("", |(above, _)| above);
+        let wanted = match known {
+            Some(absolute) if absolute.starts_with('/') => absolute.to_owned(),
+            Some(name) => format!("{above}/{name}"),
+            None => guess.clone(),
+        };
         let mut name = wanted.clone();
         let mut number = 1;
         while !taken.insert(name.clone()) {
@@ -218,10 +239,14 @@ fn apply(
             }
         }
         let node = &mut plan.nodes[*index];
-        let identity = flavour.identity(&name);
+        let own = known.map(|name| name.rsplit('/').next().unwrap_or(name));
+        let identity = match own {
+            Some(own) => flavour.renamed(own, &name),
+            None => flavour.identity(&name),
+        };
         node.name = name;
         tell_parameters(flavour, node, &plan.parameters);
-        node.argv.extend(identity.arguments);
+        flavour.put(identity.arguments, &mut node.argv);
         node.environment.extend(identity.environment);
     }
 }
@@ -365,6 +390,41 @@ mod tests {
             ..Interface::default()
         };
         assert!(unused(&plan, &interface, &options).is_empty());
+    }
+
+    #[test]
+    fn nodes_of_ros_2_keep_their_namespaces_and_are_renamed_alone() {
+        let flavour = Flavour {
+            ros: ros::flavour::Version::Ros2,
+            ..Flavour::default()
+        };
+        let mut plan = plan(&["/front/talk", "/back/talk", "/two", "/own"]);
+        for (node, namespace) in plan.nodes.iter_mut().zip(["/front", "/back"]) {
+            let words = ["--ros-args", "-r", &*format!("__ns:={namespace}")];
+            node.argv.extend(words.map(str::to_owned));
+        }
+        let found = [(0, "talker"), (1, "talker"), (2, "own"), (3, "/chosen/own")];
+        let found = found.map(|(index, name)| (index, name.to_owned()));
+        let given = PushOptions::default();
+        apply(&mut plan, &flavour, &[0, 1, 2, 3], &found, &given);
+        let told = |index: usize| {
+            let node: &NodeSpec = &plan.nodes[index];
+            (node.name.as_str(), node.argv.join(" "))
+        };
+        let kept = |namespace: &str| format!("/x --ros-args -r __ns:={namespace}");
+        assert_eq!(told(0), ("/front/talker", kept("/front")));
+        assert_eq!(told(1), ("/back/talker", kept("/back")));
+        assert_eq!(told(2), ("/own", "/x".to_owned()));
+        assert_eq!(told(3), ("/chosen/own", "/x".to_owned()));
+        // Two of one name: the second one's program may be other nodes, too.
+        let mut twice = self::plan(&["/talker", "/talker"]);
+        let found = [(0, "talker".to_owned()), (1, "talker".to_owned())];
+        apply(&mut twice, &flavour, &[0, 1], &found, &given);
+        assert_eq!(twice.nodes[1].name, "/talker_2");
+        assert_eq!(
+            twice.nodes[1].argv,
+            ["/x", "--ros-args", "-r", "talker:__node:=talker_2"]
+        );
     }
 
     #[test]

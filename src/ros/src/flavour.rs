@@ -77,6 +77,25 @@ impl Flavour {
         }
     }
 
+    /// What calls a program's node of the name `own` (without namespace) by this absolute name. Where a program may be several nodes (ROS 2) the others
+    /// keep theirs, and one that is called so already is told nothing.
+    pub fn renamed(&self, own: &str, node: &str) -> Identity {
+        match self.ros {
+            Version::Ros1 => ros1::process::identity(node),
+            Version::Ros2 => ros2::process::renamed(own, node),
+        }
+    }
+
+    /// Puts an identity's arguments on a command line, so that they count: of several rules for a name the last one does in ROS 1, the first one in
+    /// ROS 2.
+    pub fn put(&self, arguments: Vec<String>, argv: &mut Vec<String>) {
+        let at = match self.ros {
+            Version::Ros1 => argv.len(),
+            Version::Ros2 => ros2::process::first_rule(argv),
+        };
+        argv.splice(at..at, arguments);
+    }
+
     /// What puts a program that chooses its name itself into a namespace.
     pub fn namespace(&self, namespace: &str) -> Identity {
         match self.ros {

@@ -36,6 +36,21 @@ pub(crate) fn identity(node: &str) -> Identity {
     remapped(&[("__node", last), ("__ns", or_root(above))])
 }
 
+/// A rule for one node of a process alone.
+pub(crate) fn renamed(own: &str, node: &str) -> Identity {
+    let last = node.rsplit('/').next().unwrap_or(node);
+    match own == last {
+        true => Identity::default(),
+        false => remapped(&[(&format!("{own}:__node"), last)]),
+    }
+}
+
+/// Where a rule stands before all others of a command line: rcl takes the first that fits.
+pub(crate) fn first_rule(argv: &[String]) -> usize {
+    let first = argv.iter().position(|word| word == ROS_ARGUMENTS);
+    first.unwrap_or(argv.len())
+}
+
 pub(crate) fn namespace(namespace: &str) -> Identity {
     remapped(&[("__ns", or_root(namespace))])
 }
@@ -156,6 +171,16 @@ fn ros_arguments(rules: impl Iterator<Item = [String; 2]>) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_node_of_a_process_is_renamed_before_all_other_rules() {
+        assert_eq!(renamed("talker", "/front/talker"), Identity::default());
+        let told = renamed("talker", "/front/talker_2").arguments;
+        assert_eq!(told, ["--ros-args", "-r", "talker:__node:=talker_2"]);
+        let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
+        assert_eq!(first_rule(&argv("/x -v --ros-args -r __ns:=/front")), 2);
+        assert_eq!(first_rule(&argv("/x -v")), 2);
+    }
 
     #[test]
     fn a_node_is_told_its_name_and_its_namespace() {
