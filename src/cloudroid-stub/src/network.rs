@@ -1,11 +1,14 @@
 //! Where a stub of ROS 2 looks for the robot's nodes: what the environment says, by the names and values that ROS 2's own nodes
 //! read (docs.ros.org, "Improved Dynamic Discovery").
 
+mod servers;
+
 use std::net::{IpAddr, SocketAddr};
 
 use anyhow::bail;
 use ros::{Interfaces, Network};
 
+use self::servers::servers_found;
 use crate::resolver;
 
 const DOMAIN: &str = "ROS_DOMAIN_ID";
@@ -31,8 +34,8 @@ enum Range {
 /// The domain and the network of a node in this environment.
 ///
 /// # Errors
-/// A variable has a value that ROS 2 does not know, or names discovery servers. A peer that cannot be found is named in
-/// the log, as by ROS 2's nodes, and left out.
+/// A variable has a value that ROS 2 does not know, or names a discovery server that cannot be found or spoken with. A peer that
+/// cannot be found is named in the log, as by ROS 2's nodes, and left out.
 pub async fn network(variable: Variable<'_>) -> anyhow::Result<(u16, Network)> {
     let given = |name: &str| variable(name).filter(|value| !value.is_empty());
     let domain = domain(given(DOMAIN).as_deref())?;
@@ -51,24 +54,23 @@ pub async fn network(variable: Variable<'_>) -> anyhow::Result<(u16, Network)> {
     }
     // Where it is only for this machine, ROS 2 does not read it either.
     let peers = given(PEERS).filter(|_| !this_machine);
-    let peers = peers_found(&peers.unwrap_or_default()).await;
-    let servers = given(SERVERS).unwrap_or_default();
-    if entries(&servers).next().is_some() {
-        bail!(
-            "{SERVERS} is {servers:?}, and a stub is no client of Fast DDS's discovery server yet: unset it for this node and the nodes that it \
-             speaks with, which then find each other by multicast, or name their hosts in {PEERS}"
-        );
+    let mut peers = peers_found(&peers.unwrap_or_default()).await;
+    let servers = servers_found(&given(SERVERS).unwrap_or_default()).await?;
+    if !servers.is_empty() && !peers.is_empty() {
+        tracing::warn!("{PEERS} is not used where {SERVERS} is, as by Fast DDS");
+        peers.clear();
     }
-    let elsewhere = |address: &SocketAddr| !address.ip().is_loopback();
-    let is_wide = range == Range::Subnet || peers.iter().any(elsewhere);
+    let mut named = servers.iter().map(|server| &server.at).chain(&peers);
+    let is_wide = range == Range::Subnet || named.any(|address| !address.ip().is_loopback());
     let network = Network {
         interfaces: match is_wide && !this_machine {
             true => Interfaces::All,
             false => Interfaces::default(),
         },
-        multicast: range == Range::Subnet,
+        multicast: range == Range::Subnet && servers.is_empty(),
         alone: false,
         peers,
+        servers,
         well_known: true,
     };
     Ok((domain, network))
@@ -237,13 +239,24 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn discovery_servers_are_refused() {
-        let told = bad(&[(SERVERS, ";10.0.0.7:11888")]).await;
-        assert!(
-            told.contains("10.0.0.7:11888") && told.contains(PEERS),
-            "{told}"
-        );
-        // Nothing but the numbers of servers that are not used.
+    async fn where_servers_are_named_nothing_else_is_looked_at() {
+        let given = [(SERVERS, ";10.0.0.7:11888"), (PEERS, "10.0.0.8")];
+        let (_, network) = good(&given).await;
+        let [server] = network.servers[..] else {
+            panic!("{network:?}");
+        };
+        assert_eq!((server.place, server.at.port()), (1, 11888));
+        assert!(!network.multicast && network.peers.is_empty());
+        assert_eq!(network.interfaces, Interfaces::All);
+        // A server elsewhere has to reach us, one here has not.
+        let of = |server| [(SERVERS, server), (RANGE, "LOCALHOST")];
+        let interfaces = |(_, network): (u16, Network)| network.interfaces;
+        assert_eq!(interfaces(good(&of("10.0.0.7")).await), Interfaces::All);
+        let here = interfaces(good(&of("127.0.0.1")).await);
+        assert_eq!(here, Interfaces::default());
+        let told = bad(&[(SERVERS, "10.0.0.7;TCPv4:[10.0.0.8]:42100")]).await;
+        assert!(told.contains("TCPv4:[10.0.0.8]:42100"), "{told}");
+        // Nothing but places of servers that are not there.
         assert!(good(&[(SERVERS, ";")]).await.1.multicast);
     }
 }

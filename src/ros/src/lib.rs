@@ -24,4 +24,4 @@ pub mod turns;
 
 pub use connect::connect;
 pub use join::JoinOptions;
-pub use network::{Interface, Interfaces, Network};
+pub use network::{DiscoveryServer, Interface, Interfaces, Network};

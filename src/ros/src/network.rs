@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-pub use rtps::{Interface, Interfaces};
+pub use rtps::{DiscoveryServer, Interface, Interfaces};
 
 /// Where a node looks for others, and is found by them (ROS 2). By default it is in a servant's network, which has nothing but `lo`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,6 +15,8 @@ pub struct Network {
     pub alone: bool,
     /// Others that are told of it beside: their ports for discovery, or all those of a host's nodes where the port is 0.
     pub peers: Vec<SocketAddr>,
+    /// Servers of discovery of Fast DDS: where there are some, others are looked for by them alone.
+    pub servers: Vec<DiscoveryServer>,
     /// Whether it has ports that others try without having been told of them.
     pub well_known: bool,
 }
@@ -26,6 +28,7 @@ impl Default for Network {
             multicast: true,
             alone: false,
             peers: Vec::new(),
+            servers: Vec::new(),
             well_known: false,
         }
     }

@@ -15,14 +15,16 @@ mod incoming;
 mod matching;
 mod networks;
 mod outgoing;
+mod participants;
 mod paths;
 mod ports;
+mod servers;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::io::IoSlice;
-use std::net::{IpAddr, SocketAddr, SocketAddrV4};
+use std::net::{SocketAddr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -31,10 +33,11 @@ use tokio::sync::watch;
 
 pub(crate) use self::discovering::BUILTIN;
 use self::paths::Path;
+use self::servers::Via;
 use crate::discovery::ParticipantData;
 use crate::locator::Ports;
 use crate::network::Network;
-use crate::participant::{Discovered, Ends, Sample, Sink};
+use crate::participant::{Discovered, DiscoveryServer, Ends, Sample, Sink};
 use crate::qos::{Durability, EndpointQos, History};
 use crate::reader::{Bounds, ReaderState};
 use crate::time::WireTime;
@@ -75,9 +78,11 @@ struct Remote {
     discovery: SocketAddr,
     /// Where its ends receive.
     user: SocketAddr,
-    /// The address from which it was heard last.
-    source: IpAddr,
+    /// By whom it is known.
+    via: Via,
     heard: Instant,
+    /// When it was asked first whether it is there, since it was heard last.
+    asked: Option<Instant>,
 }
 
 /// A writer of ours.
@@ -102,6 +107,8 @@ pub(crate) struct Settings {
     pub bounds: Bounds,
     /// Where it announces itself to whoever does not know it yet.
     pub announce_to: Vec<SocketAddr>,
+    /// Servers of discovery: where there are some, it announces itself to them alone.
+    pub servers: Vec<DiscoveryServer>,
     pub network: Network,
     /// Whether it tells nobody of itself, and hears nobody.
     pub alone: bool,
@@ -113,6 +120,7 @@ pub(crate) struct Engine {
     ports: Ports,
     bounds: Bounds,
     announce_to: Vec<SocketAddr>,
+    servers: Vec<DiscoveryServer>,
     announcements: i64,
     announce_at: Instant,
     announce_pause: Duration,
@@ -147,6 +155,7 @@ impl Engine {
             ports,
             bounds,
             announce_to,
+            servers,
             network,
             alone,
         } = settings;
@@ -155,6 +164,7 @@ impl Engine {
             ports,
             bounds,
             announce_to,
+            servers,
             announcements: 0,
             announce_at: now,
             announce_pause: discovering::FIRST_PAUSE,
@@ -179,6 +189,9 @@ impl Engine {
             closed: false,
         };
         engine.add_builtin_ends();
+        if engine.is_client() {
+            engine.add_ends_for_servers(now);
+        }
         engine
     }
 
@@ -225,7 +238,7 @@ impl Engine {
             }
         }
         for (entity, sample) in announcements {
-            self.end_heard(entity, &sample);
+            self.announced(now, entity, &sample);
         }
         for answer in answers {
             self.answer(answer);
@@ -245,9 +258,9 @@ impl Engine {
     }
 
     /// Says good-bye; what is lined up then is the last.
-    pub fn close(&mut self) {
+    pub fn close(&mut self, now: Instant) {
         if !std::mem::replace(&mut self.closed, true) {
-            self.say_goodbye();
+            self.say_goodbye(now);
         }
     }
 

@@ -36,7 +36,8 @@ pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
 pub use network::{Interface, Interfaces, interfaces};
 pub use participant::{
-    Config, Discovered, Ends, JoinError, Participant, Place, Reader, Sample, Sink, Topic, Writer,
+    Config, Discovered, DiscoveryServer, Ends, JoinError, Participant, Place, Reader, Sample, Sink,
+    Topic, Writer,
 };
 pub use qos::{
     Durability, EndpointQos, History, Liveliness, Mismatch, Reliability, Representations,

@@ -69,6 +69,27 @@ pub struct Config {
     pub well_known: bool,
     /// Where to announce oneself beside: other participants' ports for discovery; those that the first 32 of a machine have, where the port is 0.
     pub peers: Vec<SocketAddr>,
+    /// Servers of discovery of Fast DDS. Where there are some it tells them alone of itself, and hears of others by them: neither by
+    /// multicast nor of peers.
+    pub servers: Vec<DiscoveryServer>,
+}
+
+/// A server of discovery of Fast DDS, as its clients name it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DiscoveryServer {
+    /// Its place in the list of servers, which it is itself told, and is named by.
+    pub place: u8,
+    /// Where it hears of others.
+    pub at: SocketAddr,
+}
+
+impl DiscoveryServer {
+    /// Its name, by its place: `44.53.PLACE.5f.45.50.52.4f.53.49.4d.41`.
+    pub fn prefix(&self) -> GuidPrefix {
+        let mut prefix = *b"DS\0_EPROSIMA";
+        prefix[2] = self.place;
+        GuidPrefix(prefix)
+    }
 }
 
 impl Config {
@@ -86,6 +107,7 @@ impl Config {
             alone: false,
             well_known: false,
             peers: Vec::new(),
+            servers: Vec::new(),
         }
     }
 }
@@ -218,7 +240,8 @@ impl Participant {
                 place.datagrams(any, false).await?,
             )
         };
-        let multicast = match config.multicast && !config.alone {
+        let by_itself = !config.alone && config.servers.is_empty();
+        let multicast = match config.multicast && by_itself {
             true => multicast(&*place, ports).await,
             false => None,
         };
@@ -236,7 +259,7 @@ impl Participant {
             let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
             announce_to.extend(peers(&[here], ports));
         }
-        if config.alone {
+        if !by_itself {
             announce_to.clear();
         }
         let bounds = Bounds {
@@ -251,6 +274,7 @@ impl Participant {
                 ports,
                 bounds,
                 announce_to,
+                servers: config.servers,
                 network: network.clone(),
                 alone: config.alone,
             },
@@ -334,7 +358,7 @@ impl Participant {
 
     /// Says good-bye. Ends that are still held become inert.
     pub async fn close(&self) {
-        self.running.shared.with(|_, engine| engine.close());
+        self.running.shared.with(|now, engine| engine.close(now));
         self.running.stop();
     }
 }

@@ -331,6 +331,13 @@ impl WriterState {
             .map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
     }
 
+    /// Up to which number a reader has all; none where it is not matched.
+    pub fn acknowledged(&self, reader: Guid) -> Option<SequenceNumber> {
+        let mut proxies = self.proxies.iter();
+        let proxy = proxies.find(|proxy| proxy.data.guid == reader)?;
+        Some(proxy.acknowledged)
+    }
+
     /// A reader tells what it has and what it misses; true where that shows for the first time that it knows this writer.
     pub fn acknack(
         &mut self,
@@ -465,6 +472,21 @@ impl WriterState {
             proxy.ask_at = Some(at.max(now) + proxy.pause);
         }
         self.ask_at()
+    }
+
+    /// Asks a reader of this participant that has answered before; whether there is one.
+    pub fn ask(&self, participant: GuidPrefix, wanted: &mut Wanted) -> bool {
+        let mut proxies = self.proxies.iter();
+        let Some(proxy) = proxies
+            .find(|proxy| proxy.data.guid.prefix == participant && proxy.reliable && proxy.heard)
+        else {
+            return false;
+        };
+        let from = self.first().max(proxy.irrelevant.next());
+        wanted
+            .heartbeats
+            .push((proxy.address, proxy.data.guid, from, true));
+        true
     }
 
     /// When `tick` is to be called.

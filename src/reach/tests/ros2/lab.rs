@@ -177,6 +177,11 @@ impl Peer {
     pub fn kill(&mut self) {
         self.child.start_kill().expect("it can be killed");
     }
+
+    /// The same; returns when it is no more.
+    pub async fn ends(&mut self) {
+        self.child.kill().await.expect("it can be killed");
+    }
 }
 
 pub fn string() -> Arc<MessageType> {

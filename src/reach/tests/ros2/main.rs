@@ -9,5 +9,6 @@ mod network;
 mod network_pictures;
 mod parameters;
 mod robot;
+mod servers;
 mod services;
 mod topics;

@@ -81,7 +81,7 @@ pub fn machines() -> (Lab, Lab) {
 }
 
 /// Says things on `/ping`, and hears each on `/pong`.
-async fn converse(bus: &Ros2Bus) -> Subscription {
+pub async fn converse(bus: &Ros2Bus) -> Subscription {
     let qos = Qos::keep_last(10);
     let mut pong = bus.subscribe("/pong", of_string(), qos).await.unwrap();
     let ping = bus.advertise("/ping", of_string(), qos).await.unwrap();
@@ -99,7 +99,7 @@ async fn converse(bus: &Ros2Bus) -> Subscription {
 }
 
 /// Calls its service, and has it call ours.
-async fn call_each_other(bus: &Ros2Bus, peer: &mut Peer, answer: &[serde_json::Value]) {
+pub async fn call_each_other(bus: &Ros2Bus, peer: &mut Peer, answer: &[serde_json::Value]) {
     shows(bus, |graph| graph.services.contains_key("/set")).await;
     let answered = bus.call("/set", request(true), LONG).await.unwrap();
     let expected = r#"{"success":true,"message":"set"}"#;
@@ -111,7 +111,7 @@ async fn call_each_other(bus: &Ros2Bus, peer: &mut Peer, answer: &[serde_json::V
 }
 
 /// How long it takes until its being killed is noticed.
-async fn killed(peer: &mut Peer, pong: Subscription) -> Duration {
+pub async fn killed(peer: &mut Peer, pong: Subscription) -> Duration {
     let mut matched = pong.matched.clone();
     let begun = Instant::now();
     peer.kill();

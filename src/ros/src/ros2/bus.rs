@@ -111,6 +111,7 @@ impl Ros2Bus {
             multicast: network.multicast,
             alone: network.alone,
             peers: network.peers,
+            servers: network.servers,
             well_known: network.well_known,
             user_data: Bytes::from_static(USER_DATA),
             max_sample: options.max_message,

@@ -35,6 +35,11 @@ const KNOWN: [u16; 11] = [
 impl ParticipantData {
     /// As the payload of a sample. A name or user data of more than 65,527 bytes is left out.
     pub fn to_bytes(&self) -> Bytes {
+        self.to_bytes_with(&[])
+    }
+
+    /// The same, with properties: names and their values.
+    pub fn to_bytes_with(&self, properties: &[(&str, &str)]) -> Bytes {
         let mut bytes = list_header();
         let mut list = ParameterWriter::new(&mut bytes);
         list.raw(pid::PROTOCOL_VERSION, &self.version);
@@ -59,6 +64,9 @@ impl ParticipantData {
         }
         if !self.user_data.is_empty() {
             list.counted(pid::USER_DATA, &self.user_data);
+        }
+        if !properties.is_empty() {
+            list.properties(pid::PROPERTY_LIST, properties);
         }
         list.end();
         bytes.into()

@@ -8,31 +8,35 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use tokio::sync::watch;
 
+use super::servers::{SPARE, Via};
 use super::{Datagram, Engine, LocalReader, LocalWriter, Remote};
 use crate::discovery::{self, EndpointData, ParticipantData};
-use crate::locator::Locator;
 use crate::participant::Sample;
 use crate::reader::ReaderState;
 use crate::wire::{self, InlineQos};
-use crate::writer::{Change, Wanted, WriterState};
+use crate::writer::{Change, WriterState};
 use crate::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 /// The first pause between two announcements; each is twice as long as the one before.
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(20);
 /// Announcements never come more seldom: a third of the lease that is told.
-const LAST_PAUSE: Duration = Duration::from_secs(3);
+pub(super) const LAST_PAUSE: Duration = Duration::from_secs(3);
 /// How often a newcomer's port is told of us: its socket may be there before whoever reads it.
 const TOLD_AGAIN: Duration = Duration::from_millis(50);
 /// More participants, and more ends of each, are not kept.
-const MOST_PARTICIPANTS: usize = 256;
+pub(super) const MOST_PARTICIPANTS: usize = 256;
 const MOST_ENDS: usize = 16_384;
 /// Ends that were taken back are told to newcomers, but not for ever.
 const MOST_WITHDRAWN: usize = 64;
 
-const DISPOSED: u32 = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
+pub(super) const DISPOSED: u32 = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
+
+/// The pair of ends by which a server of discovery and its clients announce participants.
+pub(super) const PARTICIPANTS: (EntityId, EntityId) =
+    (EntityId::SPDP_WRITER, EntityId::SPDP_READER);
 
 /// The pairs of ends by which ends are announced: who writes, and who reads.
-const ANNOUNCERS: [(EntityId, EntityId); 2] = [
+pub(super) const ANNOUNCERS: [(EntityId, EntityId); 2] = [
     (EntityId::PUBLICATIONS_WRITER, EntityId::PUBLICATIONS_READER),
     (
         EntityId::SUBSCRIPTIONS_WRITER,
@@ -41,33 +45,38 @@ const ANNOUNCERS: [(EntityId, EntityId); 2] = [
 ];
 
 /// Bits of `PID_BUILTIN_ENDPOINT_SET`: who announces ends, and who hears of them (9.3.2.12).
-const ANNOUNCES: [u32; 2] = [1 << 2, 1 << 4];
-const HEARS: [u32; 2] = [1 << 3, 1 << 5];
+pub(super) const ANNOUNCES: [u32; 2] = [1 << 2, 1 << 4];
+pub(super) const HEARS: [u32; 2] = [1 << 3, 1 << 5];
 /// What our participants have.
 pub(crate) const BUILTIN: u32 = 0x3f;
 
 impl Engine {
     pub(super) fn add_builtin_ends(&mut self) {
-        for (writer, reader) in ANNOUNCERS {
-            let own = builtin(self.own.prefix, writer);
-            self.writers.insert(
-                writer,
-                LocalWriter {
-                    state: WriterState::new(own),
-                    ends: watch::Sender::new(Arc::default()),
-                    leaves: None,
-                },
-            );
-            let state = ReaderState::new(builtin(self.own.prefix, reader), self.bounds.clone());
-            self.readers.insert(
-                reader,
-                LocalReader {
-                    state,
-                    ends: watch::Sender::new(Arc::default()),
-                    sink: None,
-                },
-            );
+        for pair in ANNOUNCERS {
+            self.add_builtin_pair(pair);
         }
+    }
+
+    /// Who announces something, and who hears of it.
+    pub(super) fn add_builtin_pair(&mut self, (writer, reader): (EntityId, EntityId)) {
+        let own = builtin(self.own.prefix, writer);
+        self.writers.insert(
+            writer,
+            LocalWriter {
+                state: WriterState::new(own),
+                ends: watch::Sender::new(Arc::default()),
+                leaves: None,
+            },
+        );
+        let state = ReaderState::new(builtin(self.own.prefix, reader), self.bounds.clone());
+        self.readers.insert(
+            reader,
+            LocalReader {
+                state,
+                ends: watch::Sender::new(Arc::default()),
+                sink: None,
+            },
+        );
     }
 
     // ---- announcing ourselves
@@ -76,14 +85,16 @@ impl Engine {
     pub(super) fn tick_discovery(&mut self, now: Instant) -> Instant {
         if self.announce_at <= now && !self.closed {
             self.announce();
+            self.ask_silent(now);
             self.announce_at = now + self.announce_pause;
-            self.announce_pause = (self.announce_pause * 2).min(LAST_PAUSE);
+            self.announce_pause = (self.announce_pause * 2).min(self.longest_pause());
         }
         let gone = |remote: &Remote| {
-            remote
-                .data
-                .lease
-                .is_some_and(|lease| now.saturating_duration_since(remote.heard) > lease)
+            let silent = |since: Instant| now.saturating_duration_since(since);
+            remote.data.lease.is_some_and(|lease| match remote.via {
+                Via::Itself(_) | Via::Named(_) => silent(remote.heard) > lease,
+                Via::Servers => remote.asked.is_some_and(|at| silent(at) > lease + SPARE),
+            })
         };
         let silent: Vec<GuidPrefix> = self
             .remotes
@@ -105,6 +116,10 @@ impl Engine {
     }
 
     fn announce(&mut self) {
+        if self.is_client() {
+            self.announce_to_servers();
+            return;
+        }
         let known = self
             .remotes
             .values()
@@ -153,7 +168,11 @@ impl Engine {
         self.control.push_back(Datagram::whole(to, writer));
     }
 
-    pub(super) fn say_goodbye(&mut self) {
+    pub(super) fn say_goodbye(&mut self, now: Instant) {
+        if self.is_client() {
+            self.leave_servers(now);
+            return;
+        }
         let known: Vec<_> = self
             .remotes
             .values()
@@ -198,141 +217,22 @@ impl Engine {
         }
         if let Some(remote) = self.remotes.get_mut(&from) {
             remote.heard = now;
-            remote.source = source;
-            if *remote.data == told {
-                return;
-            }
-            // What it has may have changed, or where it is: then it is met anew, unless it is still there where it was.
-            let left = |told: &[Locator], at: SocketAddr| {
-                !told.iter().filter_map(Locator::udp).any(|it| it == at)
-            };
-            if left(&told.discovery, remote.discovery)
-                || remote.data.user != told.user && left(&told.user, remote.user)
-                || remote.data.builtin != told.builtin
-            {
-                self.participant_gone(from);
-            } else {
-                remote.data = Arc::new(told);
-                self.discovered
-                    .participants
-                    .insert(from, Arc::clone(&remote.data));
-                self.discovered_changed = true;
-                return;
-            }
+            remote.via = Via::Itself(source);
         }
-        self.participant_came(now, source, told);
+        self.participant_told(now, Via::Itself(source), told);
     }
 
-    pub(super) fn participant_came(&mut self, now: Instant, source: IpAddr, told: ParticipantData) {
-        let Some(discovery) = self.network.choose(&told.discovery, Some(source)) else {
-            tracing::debug!(
-                %source,
-                "a DDS participant tells no address of UDP over IPv4 that leads to it"
-            );
-            return;
-        };
-        // An address belongs to one process at a time: whoever had it before is gone.
-        let before: Vec<GuidPrefix> = self
-            .remotes
-            .iter()
-            .filter(|(_, remote)| remote.discovery == discovery)
-            .map(|(prefix, _)| *prefix)
-            .collect();
-        for prefix in before {
-            self.participant_gone(prefix);
-        }
-        if self.remotes.len() >= MOST_PARTICIPANTS {
-            tracing::warn!(
-                "more than {MOST_PARTICIPANTS} DDS participants; {:?} is not heard",
-                told.prefix
-            );
-            return;
-        }
-        let user = self
-            .network
-            .choose(&told.user, Some(discovery.ip()))
-            .unwrap_or(discovery);
-        let (prefix, vendor, has) = (told.prefix, told.vendor, told.builtin);
-        let data = Arc::new(told);
-        self.discovered
-            .participants
-            .insert(prefix, Arc::clone(&data));
-        self.discovered_changed = true;
-        self.remotes.insert(
-            prefix,
-            Remote {
-                data,
-                discovery,
-                user,
-                source,
-                heard: now,
-            },
-        );
-        self.announce_to(discovery, prefix, 0);
-        for (index, (writer, reader)) in ANNOUNCERS.into_iter().enumerate() {
-            if has & HEARS[index] != 0 {
-                let mut wanted = Wanted::default();
-                if let Some(ours) = self.writers.get_mut(&writer) {
-                    ours.state.matched(
-                        now,
-                        Arc::new(builtin(prefix, reader)),
-                        discovery,
-                        &mut wanted,
-                    );
-                }
-                self.enqueue(writer, wanted);
-            }
-            if has & ANNOUNCES[index] != 0 {
-                if let Some(ours) = self.readers.get_mut(&reader) {
-                    ours.state
-                        .matched(now, Arc::new(builtin(prefix, writer)), discovery, vendor);
-                }
-            }
-        }
-        self.announce_soon(now);
-        self.wake(now);
-    }
-
-    /// A participant has gone, and with it all its ends.
-    pub fn participant_gone(&mut self, prefix: GuidPrefix) {
-        let Some(remote) = self.remotes.remove(&prefix) else {
-            return;
-        };
-        self.discovered.participants.remove(&prefix);
-        self.discovered_changed = true;
-        for (writer, reader) in ANNOUNCERS {
-            if let Some(ours) = self.writers.get_mut(&writer) {
-                ours.state.unmatched(Guid::new(prefix, reader));
-            }
-            if let Some(ours) = self.readers.get_mut(&reader) {
-                ours.state.unmatched(Guid::new(prefix, writer));
-            }
-        }
-        let ends = self
-            .discovered
-            .writers
-            .keys()
-            .chain(self.discovered.readers.keys());
-        let ends: Vec<Guid> = ends.filter(|guid| guid.prefix == prefix).copied().collect();
-        for guid in ends {
-            self.end_gone(guid);
-        }
-        let still = |address: SocketAddr| {
-            self.remotes
-                .values()
-                .any(|other| other.discovery == address || other.user == address)
-        };
-        let unused: Vec<SocketAddr> = [remote.discovery, remote.user]
-            .into_iter()
-            .filter(|address| !still(*address))
-            .collect();
-        for address in unused {
-            self.paths.remove(&address);
+    /// Something came from one of the protocol's own writers.
+    pub(super) fn announced(&mut self, now: Instant, reader: EntityId, sample: &Sample) {
+        if reader == EntityId::SPDP_READER {
+            self.server_tells(now, sample);
+        } else {
+            self.end_heard(now, reader, sample);
         }
     }
 
-    /// Something came from one of the protocol's own writers: an end, or that one is gone.
-    pub(super) fn end_heard(&mut self, reader: EntityId, sample: &Sample) {
+    /// An end, or that one is gone.
+    fn end_heard(&mut self, now: Instant, reader: EntityId, sample: &Sample) {
         if let Some(gone) = sample.withdrawn {
             self.end_gone(gone);
             return;
@@ -344,7 +244,10 @@ impl Engine {
                 return;
             }
         };
-        let fits = told.guid.prefix == sample.writer.prefix
+        let whose = told.guid.prefix;
+        let told_by_server =
+            self.is_server(sample.writer.prefix) && self.remotes.contains_key(&whose);
+        let fits = (whose == sample.writer.prefix || told_by_server)
             && told.guid.entity.is_writer() == (reader == EntityId::PUBLICATIONS_READER)
             && !told.guid.entity.is_builtin();
         if !fits {
@@ -358,20 +261,21 @@ impl Engine {
             );
             return;
         }
-        self.end_came(Instant::now(), Arc::new(told));
+        self.end_came(now, Arc::new(told));
     }
 
     // ---- our ends
 
     pub(super) fn announce_end(&mut self, now: Instant, own: &EndpointData) {
-        let announcer = announcer(own.guid.entity);
-        let number = self.publish(
-            now,
-            announcer,
-            Engine::change_of_announcement(own.to_bytes()),
-        );
-        // Of an end that was announced before, newcomers need the last word alone.
-        if let Some(before) = self.announced.insert(own.guid.entity, number) {
+        self.announce_as(now, own.guid.entity, own.to_bytes());
+    }
+
+    /// Announces an end of ours, or the participant.
+    pub(super) fn announce_as(&mut self, now: Instant, entity: EntityId, payload: Bytes) {
+        let announcer = announcer(entity);
+        let number = self.publish(now, announcer, Engine::change_of_announcement(payload));
+        // Of what was announced before, newcomers need the last word alone.
+        if let Some(before) = self.announced.insert(entity, number) {
             if let Some(writer) = self.writers.get_mut(&announcer) {
                 writer.state.forget(before);
             }
@@ -405,7 +309,9 @@ impl Engine {
 }
 
 fn announcer(entity: EntityId) -> EntityId {
-    if entity.is_writer() {
+    if entity == EntityId::PARTICIPANT {
+        EntityId::SPDP_WRITER
+    } else if entity.is_writer() {
         EntityId::PUBLICATIONS_WRITER
     } else {
         EntityId::SUBSCRIPTIONS_WRITER
@@ -413,7 +319,7 @@ fn announcer(entity: EntityId) -> EntityId {
 }
 
 /// One of the protocol's own ends.
-fn builtin(prefix: GuidPrefix, entity: EntityId) -> EndpointData {
+pub(super) fn builtin(prefix: GuidPrefix, entity: EntityId) -> EndpointData {
     EndpointData {
         guid: Guid::new(prefix, entity),
         topic: String::new(),

@@ -146,9 +146,13 @@ impl Engine {
         &mut self,
         now: Instant,
         entity: EntityId,
-        change: Change,
+        mut change: Change,
     ) -> SequenceNumber {
         let mut wanted = Wanted::default();
+        let Some(next) = self.writers.get(&entity).map(|it| it.state.last().next()) else {
+            return SequenceNumber::UNKNOWN;
+        };
+        change.related = self.identity(entity, next).or(change.related);
         let Some(writer) = self.writers.get_mut(&entity) else {
             return SequenceNumber::UNKNOWN;
         };

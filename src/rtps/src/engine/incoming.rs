@@ -27,6 +27,7 @@ impl Engine {
             // Whoever says anything is there.
             if let Some(remote) = self.remotes.get_mut(&received.from) {
                 remote.heard = now;
+                remote.asked = None;
             }
             let other = received
                 .to
@@ -47,16 +48,19 @@ impl Engine {
             ..
         } = received;
         match submessage {
-            Submessage::Data(data) if data.writer == EntityId::SPDP_WRITER => {
+            Submessage::Data(data) if data.writer == EntityId::SPDP_WRITER && !self.is_client() => {
                 self.participant_heard(now, from, source, &data)
             }
             Submessage::Data(data) => {
+                if data.writer == EntityId::SPDP_WRITER {
+                    self.server_heard(now, from, source, &data);
+                }
                 let writer = Guid::new(from, data.writer);
                 let withdrawn = (data.inline.status != 0)
                     .then(|| discovery::guid_of_key(&data))
                     .flatten();
                 let is_sample = data.payload.is_some() && !data.key_only && data.inline.status == 0;
-                self.for_readers(data.reader, writer, |reader, out| {
+                self.for_readers(now, data.reader, writer, |reader, out| {
                     if is_sample || (reader.sink.is_none() && withdrawn.is_some()) {
                         let sample = Sample {
                             payload: data.payload.clone().unwrap_or_default(),
@@ -76,27 +80,27 @@ impl Engine {
             Submessage::DataFrag(frag) => {
                 let writer = Guid::new(from, frag.writer);
                 if !frag.key_only {
-                    self.for_readers(frag.reader, writer, |reader, out| {
+                    self.for_readers(now, frag.reader, writer, |reader, out| {
                         reader.state.data_frag(now, writer, &frag, written, out)
                     });
                 }
             }
             Submessage::Heartbeat(beat) => {
                 let writer = Guid::new(from, beat.writer);
-                self.for_readers(beat.reader, writer, |reader, out| {
+                self.for_readers(now, beat.reader, writer, |reader, out| {
                     reader.state.heartbeat(now, writer, &beat, out)
                 });
             }
             Submessage::HeartbeatFrag(beat) => {
                 let writer = Guid::new(from, beat.writer);
-                self.for_readers(beat.reader, writer, |reader, _| {
+                self.for_readers(now, beat.reader, writer, |reader, _| {
                     reader.state.heartbeat_frag(now, writer, &beat);
                     false
                 });
             }
             Submessage::Gap(gap) => {
                 let writer = Guid::new(from, gap.writer);
-                self.for_readers(gap.reader, writer, |reader, out| {
+                self.for_readers(now, gap.reader, writer, |reader, out| {
                     reader.state.gap(writer, &gap, out);
                     false
                 });
@@ -104,6 +108,7 @@ impl Engine {
             Submessage::AckNack(ack) => {
                 let mut wanted = Wanted::default();
                 let reader = Guid::new(from, ack.reader);
+                self.server_acknowledges(now, reader, ack.writer, &ack.set);
                 if let Some(writer) = self.writers.get_mut(&ack.writer) {
                     if writer.state.acknack(
                         now,
@@ -142,6 +147,7 @@ impl Engine {
     /// time that the writer knows the reader.
     fn for_readers(
         &mut self,
+        now: Instant,
         entity: EntityId,
         writer: Guid,
         mut take: impl FnMut(&mut LocalReader, &mut Vec<Sample>) -> bool,
@@ -170,7 +176,7 @@ impl Engine {
         }
         self.tick_at = due;
         for (entity, sample) in announcements {
-            self.end_heard(entity, &sample);
+            self.announced(now, entity, &sample);
         }
     }
 }

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use super::Engine;
+use super::servers::Via;
 use crate::GuidPrefix;
 use crate::locator::Locator;
 use crate::network::Network;
@@ -32,6 +33,9 @@ impl Engine {
         if (&discovery, &user) != (&self.own.discovery, &self.own.user) {
             self.own.discovery = discovery;
             self.own.user = user;
+            if self.is_client() {
+                self.announce_self(now);
+            }
             self.announce_ends_again(now);
         }
         let moved: Vec<GuidPrefix> = self
@@ -40,7 +44,11 @@ impl Engine {
             .filter(|(_, remote)| {
                 let leads = self.network.leads_to(remote.discovery.ip());
                 let told = &remote.data.discovery;
-                let chosen = || self.network.choose(told, Some(remote.source));
+                let chosen = || match remote.via {
+                    Via::Itself(source) => self.network.choose(told, Some(source)),
+                    Via::Servers => self.network.choose(told, None),
+                    Via::Named(address) => Some(address),
+                };
                 !leads && chosen().is_some_and(|chosen| chosen != remote.discovery)
             })
             .map(|(prefix, _)| *prefix)
@@ -78,8 +86,7 @@ impl Engine {
         let Some(remote) = self.remotes.get(&prefix) else {
             return;
         };
-        let (told, source) = ((*remote.data).clone(), remote.source);
-        self.participant_gone(prefix);
-        self.participant_came(now, source, told);
+        let (told, via) = ((*remote.data).clone(), remote.via);
+        self.participant_met_anew(now, via, told);
     }
 }

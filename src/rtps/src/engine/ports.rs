@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::time::Instant;
 
+use super::servers::Via;
 use super::{Engine, Remote};
 use crate::GuidPrefix;
 
@@ -23,14 +24,17 @@ impl Engine {
             .chain(self.bound.iter().copied())
             .collect();
         let taken = |port: u16| known.iter().any(|at| at.port() == port);
-        // Participants take the lowest number whose ports are free.
-        let free = (0..)
+        // Participants take the lowest number whose ports are free. A client's concern are its servers.
+        let numbers = if self.is_client() { 0..0 } else { 0..u16::MAX };
+        let free = numbers
             .map_while(|number| self.ports.discovery(number))
             .filter(|port| !taken(*port))
             .take(NUMBERS_AHEAD)
             .map(|port| SocketAddrV4::new(Ipv4Addr::LOCALHOST, port));
         let own = self.own_ports().0;
-        let mut ports: BTreeSet<SocketAddrV4> = free.chain(known.iter().copied()).collect();
+        let servers = self.servers_here();
+        let mut ports: BTreeSet<SocketAddrV4> =
+            free.chain(known.iter().copied()).chain(servers).collect();
         ports.retain(|at| at.port() != own);
         ports
     }
@@ -39,15 +43,18 @@ impl Engine {
     pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<SocketAddrV4>) {
         let last = self.ports.discovery(119).unwrap_or(u16::MAX);
         let domain = self.ports.discovery_multicast()..=last;
-        let found: BTreeSet<SocketAddrV4> = bound
-            .iter()
-            .filter(|at| domain.contains(&at.port()))
-            .copied()
-            .collect();
+        let servers: BTreeSet<SocketAddrV4> = self.servers_here().collect();
+        let concerns = |at: &&SocketAddrV4| match self.is_client() {
+            true => servers.contains(at),
+            false => domain.contains(&at.port()),
+        };
+        let found: BTreeSet<SocketAddrV4> = bound.iter().filter(concerns).copied().collect();
         let new: Vec<SocketAddrV4> = found.difference(&self.bound).copied().collect();
         if !new.is_empty() {
-            for at in new {
-                self.announce_to(SocketAddr::V4(at), GuidPrefix::UNKNOWN, 0);
+            if !self.is_client() {
+                for at in new {
+                    self.announce_to(SocketAddr::V4(at), GuidPrefix::UNKNOWN, 0);
+                }
             }
             self.announce_soon(now);
         }
@@ -67,6 +74,8 @@ impl Engine {
     /// Where a participant of this machine hears of others.
     fn here(&self, remote: &Remote) -> Option<SocketAddrV4> {
         match remote.discovery {
+            // It may be reached through another's port.
+            _ if matches!(remote.via, Via::Named(_)) => None,
             SocketAddr::V4(at) if self.network.is_here((*at.ip()).into()) => Some(at),
             _ => None,
         }

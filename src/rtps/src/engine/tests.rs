@@ -1,5 +1,7 @@
 //! Participants on a network made of queues: it loses what it is told to lose, and time passes when nothing else happens.
 
+use std::net::IpAddr;
+
 use parking_lot::Mutex;
 
 use super::*;
@@ -110,6 +112,7 @@ impl World {
                 ports,
                 bounds,
                 announce_to,
+                servers: Vec::new(),
                 network: Network::new(Vec::new()),
                 alone: false,
             },
@@ -517,7 +520,7 @@ fn ends_that_are_taken_back_are_gone_there_too() {
     drop(world.engines[1].remove_end(now, reader.entity));
     world.pass(SECOND);
     assert_eq!(ends.borrow().matched.len(), 0);
-    world.engines[1].close();
+    world.engines[1].close(world.now);
     world.pass(SECOND / 10);
     assert!(
         world.engines[0]

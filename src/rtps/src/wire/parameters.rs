@@ -32,6 +32,7 @@ pub(crate) mod pid {
     pub const EXPECTS_INLINE_QOS: u16 = 0x0043;
     pub const PARTICIPANT_GUID: u16 = 0x0050;
     pub const BUILTIN_ENDPOINT_SET: u16 = 0x0058;
+    pub const PROPERTY_LIST: u16 = 0x0059;
     pub const ENDPOINT_GUID: u16 = 0x005a;
     pub const ENTITY_NAME: u16 = 0x0062;
     pub const KEY_HASH: u16 = 0x0070;
@@ -162,6 +163,18 @@ impl<'a> ParameterWriter<'a> {
     pub fn counted(&mut self, number: u16, bytes: &[u8]) -> &mut Self {
         let mut value = (bytes.len() as u32).to_le_bytes().to_vec();
         value.extend_from_slice(bytes);
+        self.raw(number, &value)
+    }
+
+    /// Names and their values (DDS-Security 1.1, 7.2.1): a sequence of pairs of strings of CDR.
+    pub fn properties(&mut self, number: u16, properties: &[(&str, &str)]) -> &mut Self {
+        let mut value = (properties.len() as u32).to_le_bytes().to_vec();
+        for text in properties.iter().flat_map(|(name, value)| [name, value]) {
+            value.extend_from_slice(&(text.len() as u32 + 1).to_le_bytes());
+            value.extend_from_slice(text.as_bytes());
+            value.push(0);
+            value.resize(value.len().next_multiple_of(4), 0);
+        }
         self.raw(number, &value)
     }
 

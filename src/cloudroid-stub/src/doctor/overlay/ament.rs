@@ -80,7 +80,13 @@ async fn domain(variable: Variable<'_>) -> Check {
                 Interfaces::All => "on all networks of this robot",
                 _ => "on this machine alone",
             };
-            Check::good("domain", format!("{id}, {place}"))
+            let servers = network.servers.iter().map(|server| server.at.to_string());
+            let servers: Vec<String> = servers.collect();
+            let by = match servers.is_empty() {
+                true => String::new(),
+                false => format!(", by discovery servers at {}", servers.join(" and ")),
+            };
+            Check::good("domain", format!("{id}, {place}{by}"))
         }
         Err(error) => Check::bad(
             "domain",
@@ -244,6 +250,20 @@ mod tests {
                 "domain",
                 Verdict::Good,
                 "0, on this machine alone",
+            ),
+            (
+                "ROS_DISCOVERY_SERVER",
+                "10.0.0.7;10.0.0.8:14520",
+                "domain",
+                Verdict::Good,
+                "0, on all networks of this robot, by discovery servers at 10.0.0.7:11811 and 10.0.0.8:14520",
+            ),
+            (
+                "ROS_DISCOVERY_SERVER",
+                "TCPv4:[10.0.0.7]:42100",
+                "domain",
+                Verdict::Bad,
+                "which is reached by TCP",
             ),
             (
                 "ROS_DOMAIN_ID",
