@@ -14,6 +14,7 @@ mod crowd;
 mod ends;
 mod hop;
 mod joins;
+mod lost;
 mod message;
 mod pictures;
 mod place;

@@ -14,6 +14,7 @@ use serde_json::json;
 use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 
+use crate::lost;
 use crate::place::Within;
 use crate::roles::{say, until_asked};
 use crate::types;
@@ -24,7 +25,7 @@ pub(crate) const ADDRESS: &str = "127.0.0.1:9090";
 const NODE: &str = "/cloudroid_bridge";
 
 /// `portal kept`: one bridge, which is there before its clients; `portal fresh`: one for each client, made when it comes, as
-/// for the first robot of a servant that runs. When asked, it tells how many messages the kept one has left out.
+/// for the first robot of a servant that runs. When asked, the kept one tells how many messages it has passed on, and left out.
 pub(crate) fn play(words: &[&str]) -> Result<()> {
     let kept = match words {
         ["kept"] => true,
@@ -46,10 +47,9 @@ pub(crate) fn play(words: &[&str]) -> Result<()> {
         say(&json!({}));
         tokio::spawn(listens(listener, bridge.clone(), known));
         while until_asked().await? {
-            let drops = bridge
-                .iter()
-                .flat_map(|bridge| bridge.metrics().drops.all());
-            say(&json!({"dropped": drops.map(|(_, count)| count).sum::<u64>()}));
+            say(&bridge
+                .as_ref()
+                .map_or(json!({}), |bridge| lost::counts(bridge.metrics())));
         }
         anyhow::Ok(())
     });

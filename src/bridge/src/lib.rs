@@ -32,6 +32,7 @@ mod bridge;
 mod client;
 mod clock;
 mod connection;
+mod counted;
 mod cut;
 mod fanout;
 mod granted;

@@ -98,6 +98,8 @@ metrics! {
     throttled => "cloudroid_bridge_throttled_total",
     /// Messages dropped between ROS and the bridge.
     bus_dropped => "cloudroid_bridge_bus_dropped_total",
+    /// Messages of clients dropped because a node read too slowly.
+    node_dropped => "cloudroid_bridge_node_dropped_total",
     /// Service calls from clients.
     calls => "cloudroid_bridge_calls_total",
     /// Service calls from clients that failed.

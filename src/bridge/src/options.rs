@@ -31,9 +31,9 @@ pub struct BridgeOptions {
     pub control_bytes: usize,
     /// Messages kept per topic for a client that reads slowly; the oldest are dropped beyond.
     pub topic_messages: usize,
-    /// Bytes of those; one message is always kept.
+    /// Bytes of those. However large they are, two are kept; as many as the client asked for where it did, at most ten.
     pub topic_bytes: usize,
-    /// Bytes kept for one client over all its topics; one message is always kept.
+    /// Bytes kept for one client over all its topics; one message is always kept. Its budget is a bound, too.
     pub session_bytes: usize,
     /// Messages that the bus keeps for the bridge, per topic.
     pub bus_queue: usize,
@@ -111,7 +111,8 @@ impl Default for BridgeOptions {
             control_bytes: 32 << 20,
             topic_messages: 1000,
             topic_bytes: 4 << 20,
-            session_bytes: 16 << 20,
+            // Ten pictures of 1920x1080.
+            session_bytes: 64 << 20,
             bus_queue: 256,
             max_subscriptions: 1000,
             max_advertisements: 1000,

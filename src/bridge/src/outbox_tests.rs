@@ -154,6 +154,21 @@ fn one_client_holds_bounded_memory_whatever_it_subscribes_to() {
 }
 
 #[test]
+fn ten_large_pictures_fit_into_one_clients_memory() {
+    let (outbox, metrics) = outbox(BridgeOptions::default());
+    let wishes = Wishes {
+        queue_length: 10,
+        ..wishes()
+    };
+    let key = outbox.add_topic("/pictures".into(), wishes);
+    for number in 0..10 {
+        outbox.sample(key, sample(1920 * 1080 * 3 + number), false);
+    }
+    assert_eq!(metrics.dropped.get(), 0);
+    assert_eq!(drain(&outbox, Instant::now()).len(), 10);
+}
+
+#[test]
 fn who_reads_no_answers_is_told_goodbye() {
     let (outbox, _) = outbox(BridgeOptions {
         control_messages: 2,

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Matched, Message, PeerId, Publisher, WireType};
+use ros::bus::{Matched, Message, PeerId, WireType};
 use ros::ring::{Bounds, Ring};
 use ros::schema::MessageType;
 use ros::sizes::Sizes;
@@ -14,6 +14,7 @@ use tokio::sync::watch;
 use tokio::time::timeout_at;
 
 use crate::INSIDE;
+use crate::counted::Counted;
 use crate::quality::Offer;
 use crate::refusals::Refusals;
 use crate::shared::Shared;
@@ -72,10 +73,10 @@ enum State {
     /// moment, since clients publish right behind their `advertise`, or as soon as rosapi names a subscriber.
     Warming {
         waiting: Ring<Bytes>,
-        publisher: Option<Box<dyn Publisher>>,
+        publisher: Option<Counted>,
     },
     Live {
-        publisher: Box<dyn Publisher>,
+        publisher: Counted,
         /// The graph in which nobody is missing but those given up.
         settled: u64,
     },
@@ -83,7 +84,7 @@ enum State {
 }
 
 impl State {
-    fn warming(publisher: Option<Box<dyn Publisher>>) -> State {
+    fn warming(publisher: Option<Counted>) -> State {
         State::Warming {
             waiting: Ring::new(WARM),
             publisher,
@@ -134,7 +135,7 @@ impl TopicPublisher {
         }
         let mut state = self.state.lock();
         if let State::Live { publisher, settled } = &mut *state
-            && self.is_incomplete(publisher.as_ref(), settled)
+            && self.is_incomplete(publisher, settled)
         {
             let subscribers = publisher.matched();
             if let State::Live { publisher, .. } =
@@ -178,7 +179,7 @@ impl TopicPublisher {
 
     /// Whether somebody is missing who was not in the graph of generation `settled`, which becomes the present one if
     /// not.
-    fn is_incomplete(&self, publisher: &dyn Publisher, settled: &mut u64) -> bool {
+    fn is_incomplete(&self, publisher: &Counted, settled: &mut u64) -> bool {
         let generation = self.shared.bus.graph().borrow().generation;
         if generation == *settled {
             return false;
@@ -266,7 +267,7 @@ async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: A
     let patience = topic_publisher.patience();
     let (topic, qos) = (&topic_publisher.topic, topic_publisher.offer.qos);
     let publisher = match shared.bus.advertise(topic, of, qos).await {
-        Ok(publisher) => publisher,
+        Ok(publisher) => Counted::new(publisher, topic, shared.metrics.clone()),
         Err(error) => {
             *topic_publisher.state.lock() = State::Failed;
             return notified.failed(&error.to_string());

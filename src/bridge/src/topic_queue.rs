@@ -13,6 +13,10 @@ use crate::sample::Sample;
 
 /// Latching publishers remembered.
 const MAX_MET: usize = 1024;
+/// So many messages are kept however large they are, where a client asked for that many: as many as ROS's own queues have by default.
+const MOST_LARGE: usize = 10;
+/// As many for a client that did not say: one that is taken up while another waits costs nothing, and nobody is shown what is older than that.
+const LARGE: usize = 2;
 
 /// What one `subscribe` asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -158,12 +162,15 @@ impl TopicQueue {
     }
 
     fn is_over(&self) -> bool {
-        let asked = match self.wishes.queue_length {
-            0 => self.limits.messages,
-            length => length.min(self.limits.messages),
+        let (asked, large) = match self.wishes.queue_length {
+            0 => (self.limits.messages, LARGE),
+            length => (length.min(self.limits.messages), length.min(MOST_LARGE)),
         };
+        let waiting = self.samples.len();
         // What latching publishers said first does not count: it may never come again.
-        self.samples.exceeds(self.limits) || self.samples.len() - self.firsts() > asked
+        waiting > self.limits.messages
+            || waiting - self.firsts() > asked
+            || (waiting > large && self.samples.bytes() > self.limits.bytes)
     }
 
     /// Drops the oldest sample that can be spared.

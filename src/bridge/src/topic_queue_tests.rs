@@ -58,19 +58,46 @@ fn the_newest_win_within_messages_and_bytes() {
     assert_eq!(messages.drops.all()["/x"], 2, "told by topic");
     assert_eq!(messages.load().bytes, 25);
     let mut bytes = queue(0, 0);
-    let _ = bytes.push(sample("/p", false, 600), false, now);
-    let lost = bytes.push(sample("/p", false, 601), false, now).unwrap();
+    for size in [400, 401] {
+        let _ = bytes.push(sample("/p", false, size), false, now);
+    }
+    let lost = bytes.push(sample("/p", false, 402), false, now).unwrap();
     assert_eq!(
         (lost.messages, lost.bytes, sizes(&bytes)),
-        (1, 600, vec![601])
+        (1, 400, vec![401, 402])
     );
-    let _ = bytes.push(sample("/p", false, 5000), false, now);
-    assert_eq!(sizes(&bytes), [5000], "one message is always kept");
     let mut asked = queue(0, 2);
     for size in 1..=4 {
         let _ = asked.push(sample("/p", false, size), false, now);
     }
     assert_eq!(sizes(&asked), [3, 4]);
+}
+
+/// A picture that is taken up while the one before it waits must not cost that one, however large they are.
+#[test]
+fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
+    let now = Instant::now();
+    let kept = |asked| {
+        let mut queue = TopicQueue::new(
+            "/x".into(),
+            wishes(0, asked),
+            Bounds {
+                messages: 1000,
+                bytes: 1000,
+            },
+            Arc::default(),
+        );
+        for size in 6001..=6020 {
+            let _ = queue.push(sample("/p", false, size), false, now);
+        }
+        sizes(&queue)
+    };
+    assert_eq!(kept(1), [6020]);
+    assert_eq!(kept(5), [6016, 6017, 6018, 6019, 6020]);
+    // Whoever does not say is behind by no more than that.
+    assert_eq!(kept(0), [6019, 6020]);
+    // As many as ROS's own queues have, and no more.
+    assert_eq!(kept(1000).len(), 10);
 }
 
 #[test]

@@ -62,8 +62,10 @@ pub(crate) struct Wanted {
     pub items: Vec<(SocketAddr, Item)>,
     /// Heartbeats: to which reader, from which number on, whether an answer is wanted.
     pub heartbeats: Vec<(SocketAddr, Guid, SequenceNumber, bool)>,
-    /// Numbers that will never come, for one reader.
-    pub gaps: Vec<(SocketAddr, Guid, SequenceNumber, SequenceSet)>,
+    /// Numbers that will never come, for one reader: the first one, and the one after the last. Each run is told by itself, without the set that a
+    /// GAP can have: Fast DDS 2.14.5 looks for what it has of those in the set at the set's base, and where that is a sample of which it has
+    /// fragments, it forgets that by half (`StatefulReader::processGapMsg`). Whoever takes from that reader then tries for ever.
+    pub gaps: Vec<(SocketAddr, Guid, SequenceNumber, SequenceNumber)>,
 }
 
 /// How far one reader is.
@@ -362,7 +364,7 @@ impl WriterState {
         let known = std::mem::replace(&mut proxy.heard, true);
         let acknowledged = SequenceNumber(set.base.0.saturating_sub(1)).min(last);
         proxy.acknowledged = proxy.acknowledged.max(acknowledged);
-        let mut gap: Option<(SequenceNumber, SequenceSet)> = None;
+        let mut gaps: Vec<(SequenceNumber, SequenceNumber)> = Vec::new();
         for number in set.iter().take_while(|number| *number <= last) {
             match self
                 .history
@@ -379,16 +381,16 @@ impl WriterState {
                     );
                     wanted.items.push((proxy.address, item));
                 }
-                None => {
-                    let (_, missing) =
-                        gap.get_or_insert_with(|| (number, SequenceSet::empty(number.next())));
-                    missing.insert(number);
-                }
+                None => match gaps.last_mut() {
+                    Some((_, end)) if *end == number => *end = number.next(),
+                    _ => gaps.push((number, number.next())),
+                },
             }
         }
-        if let Some((start, missing)) = gap {
-            wanted.gaps.push((proxy.address, reader, start, missing));
-        }
+        let told = gaps
+            .into_iter()
+            .map(|(start, end)| (proxy.address, reader, start, end));
+        wanted.gaps.extend(told);
         if !is_final && set.is_empty() {
             let from = first.max(proxy.irrelevant.next());
             wanted.heartbeats.push((proxy.address, reader, from, true));
@@ -420,12 +422,9 @@ impl WriterState {
             return;
         }
         let Some(change) = self.history.get(&number) else {
-            wanted.gaps.push((
-                proxy.address,
-                reader,
-                number,
-                SequenceSet::empty(number.next()),
-            ));
+            wanted
+                .gaps
+                .push((proxy.address, reader, number, number.next()));
             return;
         };
         let total = fragments::count(change.payload.len());

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use super::paths::Prepared;
 use super::{Datagram, Engine};
 use crate::reader::Answer;
+use crate::sequence::SequenceSet;
 use crate::wire::{self, DatagramWriter, Submessage};
 use crate::writer::Wanted;
 use crate::{EntityId, GuidPrefix};
@@ -50,20 +51,18 @@ impl Engine {
             };
             out.push((to, reader.prefix, Submessage::Heartbeat(beat)));
         }
-        for (to, reader, start, set) in wanted.gaps {
+        for (to, reader, start, end) in wanted.gaps {
             // Its sample was given up, and is still being sent: it will be whole. Fast DDS 2.14 never gets over a word that there
             // is none of a sample of which it has fragments: whoever takes from that reader then tries for ever.
             let under_way = self.paths.get(&to).and_then(|path| path.sending(entity));
-            if under_way
-                .is_some_and(|number| number == start || set.iter().any(|gone| gone == number))
-            {
+            if under_way.is_some_and(|number| (start..end).contains(&number)) {
                 continue;
             }
             let gap = wire::Gap {
                 reader: reader.entity,
                 writer: entity,
                 start,
-                set,
+                set: SequenceSet::empty(end),
             };
             out.push((to, reader.prefix, Submessage::Gap(gap)));
         }

@@ -9,6 +9,7 @@ use crate::locator::Locator;
 use crate::participant::Topic;
 use crate::qos::Reliability;
 use crate::reader::Bounds;
+use crate::sequence::SequenceSet;
 use crate::{SampleIdentity, wire};
 
 /// What a reader has read.
@@ -579,6 +580,63 @@ fn a_sample_on_its_way_is_not_said_to_be_gone() {
     world.room = None;
     world.pass(SECOND);
     assert_eq!(read.marks(), [1, 2]);
+}
+
+/// Fast DDS 2.14.5 takes a number of the set of a GAP for the one at its base: where that is a sample of which it has fragments, it forgets it
+/// by half, and whoever takes from that reader then tries for ever.
+#[test]
+fn numbers_that_will_never_come_are_told_without_a_set() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(1));
+    let (_, _, read) = world.reader(1, keep(10));
+    world.pass(SECOND);
+    // 2 and 4 are replaced before they are begun, and part of 3 is out.
+    world.room = Some(33_000);
+    world.write(writer, 1, 100_000);
+    world.carry();
+    world.write(writer, 2, 100_000);
+    world.write(writer, 3, 100_000);
+    for _ in 0..4 {
+        world.carry();
+    }
+    world.write(writer, 4, 100_000);
+    world.write(writer, 5, 100_000);
+    let mut set = SequenceSet::empty(SequenceNumber(2));
+    set.insert(SequenceNumber(2));
+    set.insert(SequenceNumber(4));
+    let ask = wire::AckNack {
+        reader: read_by(&world, writer),
+        writer: writer.entity,
+        set,
+        count: 1000,
+        is_final: true,
+    };
+    let mut datagram = DatagramWriter::new(GuidPrefix([2; 12]));
+    datagram.destination(GuidPrefix([1; 12]));
+    datagram.acknack(&ask);
+    let now = world.now;
+    world.engines[0].receive(now, HERE, &datagram.finish().into());
+    let mut gaps = Vec::new();
+    while let Some(datagram) = world.engines[0].control.pop_front() {
+        let bytes: Bytes = datagram.head.into();
+        for received in wire::parse(&bytes).received {
+            if let wire::Submessage::Gap(gap) = received.submessage {
+                assert!(gap.set.is_empty(), "{gap:?}");
+                gaps.push(gap.start.0..gap.set.base.0);
+            }
+        }
+    }
+    assert_eq!(gaps, [2..3, 4..5]);
+    // The reader's own words count anew after three seconds.
+    world.room = None;
+    world.pass(SECOND * 4);
+    assert_eq!(read.marks(), [1, 3, 5]);
+}
+
+/// The reader that a writer is matched with.
+fn read_by(world: &World, writer: Guid) -> EntityId {
+    let ends = world.engines[0].writers[&writer.entity].ends.borrow();
+    ends.matched[0].guid.entity
 }
 
 #[test]
