@@ -243,6 +243,7 @@ impl Build<'_> {
             Inventory::take(&trees, of)
         })
         .await??;
+        launch::check_composition(&answer.components, &inventory.definitions)?;
         let layers = self.packed(parts).await?;
         let spec = ImageSpec {
             layers: layers.iter().map(|layer| layer.info).collect(),
@@ -274,6 +275,7 @@ impl Build<'_> {
             plan: LaunchPlan {
                 nodes: answer.nodes,
                 parameters: answer.parameters,
+                components: answer.components,
             },
             inventory,
             hold,

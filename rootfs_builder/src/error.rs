@@ -224,6 +224,30 @@ pub enum Error {
         /// The Debian package that has it.
         with: Option<String>,
     },
+    /// A class of a node is named, and nothing in the image could load it.
+    #[error(
+        "{plugin} is loaded into a component container, and the image has none: push with --with rclcpp_components"
+    )]
+    NoContainer {
+        /// The class.
+        plugin: String,
+    },
+    /// What a component is given cannot be given to it.
+    #[error("{words}")]
+    BadComponent {
+        /// What, and what can.
+        words: String,
+    },
+    /// Nodes are to be loaded, and nobody knows how to ask for that.
+    #[error(
+        "nodes are loaded into {container} by {what}, which the image does not define: push with --with composition_interfaces, or start programs of their own with --node"
+    )]
+    NoComposition {
+        /// The container's name.
+        container: String,
+        /// The type of a service.
+        what: String,
+    },
     /// An install space that was made for another Python.
     #[error(
         "the install space was made for {made_for}, and the base has {there}: push the workspace, or build it on the base's own distribution"

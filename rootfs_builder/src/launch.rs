@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
 
+use package::definitions::Definitions;
 use ros::bus::ParamValue;
 use ros::flavour::Version;
+use ros::ros2::composition::{self, Component};
 use serde::{Deserialize, Serialize};
 use servant::container::{Mount, Profile};
 use servant::spec::NodeSpec;
@@ -23,6 +25,9 @@ pub struct LaunchPlan {
     pub nodes: Vec<LaunchNode>,
     /// Parameters by absolute name, set before any node starts.
     pub parameters: BTreeMap<String, ParamValue>,
+    /// What is loaded into nodes that are component containers, by their names.
+    #[serde(default)]
+    pub components: BTreeMap<String, Vec<Component>>,
 }
 
 /// One node.
@@ -99,6 +104,8 @@ pub(crate) struct Ask {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Answer {
     pub(crate) nodes: Vec<LaunchNode>,
+    #[serde(default)]
+    pub(crate) components: BTreeMap<String, Vec<Component>>,
     pub(crate) parameters: BTreeMap<String, ParamValue>,
     pub(crate) environment: BTreeMap<String, String>,
     pub(crate) warnings: Vec<String>,
@@ -131,6 +138,12 @@ enum Refusal {
         made_for: String,
         there: String,
     },
+    NoContainer {
+        plugin: String,
+    },
+    Component {
+        words: String,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -149,6 +162,10 @@ fn scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
             (
                 "ros2_launch_plan.py",
                 include_str!("inside/ros2_launch_plan.py"),
+            ),
+            (
+                "ros2_components.py",
+                include_str!("inside/ros2_components.py"),
             ),
         ],
     }
@@ -232,6 +249,26 @@ pub(crate) async fn ask(
     Ok(answer)
 }
 
+/// Whoever loads nodes needs the definitions by which they are asked for, as the image has them.
+pub(crate) fn check_composition(
+    components: &BTreeMap<String, Vec<Component>>,
+    definitions: &Definitions,
+) -> Result<(), Error> {
+    let Some(container) = components.keys().next() else {
+        return Ok(());
+    };
+    let missing = composition::SERVICES
+        .into_iter()
+        .find(|name| !definitions.contains_key(*name));
+    match missing {
+        None => Ok(()),
+        Some(what) => Err(Error::NoComposition {
+            container: container.clone(),
+            what: what.to_owned(),
+        }),
+    }
+}
+
 fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
     let list = |names: &[String]| {
         if names.is_empty() {
@@ -250,6 +287,8 @@ fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
             },
             Refusal::NoLaunch { module } => Error::NoLaunch { module, with: None },
             Refusal::Python { made_for, there } => Error::OtherPython { made_for, there },
+            Refusal::NoContainer { plugin } => Error::NoContainer { plugin },
+            Refusal::Component { words } => Error::BadComponent { words },
             Refusal::NotFound { what, name, known } => Error::NotInPackage {
                 what: if what == "executable" {
                     "executable"
@@ -279,6 +318,8 @@ fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
     }
 }
 
+#[cfg(test)]
+mod composed;
 #[cfg(test)]
 mod of_two;
 

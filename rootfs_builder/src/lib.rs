@@ -74,4 +74,5 @@ pub use builder::{Builder, Config, DEFAULT_BASE};
 pub use error::{Error, Unresolved};
 pub use event::BuildEvent;
 pub use launch::{LaunchNode, LaunchPlan};
+pub use plan::wrong_with_components;
 pub use request::{BuildOutcome, BuiltLayer, PushRequest, Source};

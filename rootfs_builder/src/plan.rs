@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use package::names;
+use ros::ros2::composition::Component;
 
 use crate::error::Error;
 use crate::launch::{Answer, LaunchNode};
@@ -52,6 +53,9 @@ pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
         if !seen.insert(&node.name) {
             return refused(format!("two nodes are named {}", node.name));
         }
+    }
+    if let Some(problem) = wrong_with_components(&answer.components, &|name| seen.contains(name)) {
+        return refused(problem);
     }
     if let Some(problem) = wrong_with_environment(&answer.environment) {
         return refused(problem);
@@ -111,6 +115,51 @@ fn wrong_with(node: &LaunchNode) -> Option<String> {
     }
     wrong_with_environment(&node.environment)
         .map(|problem| format!("has an environment where {problem}"))
+}
+
+/// What is wrong with what is loaded into containers, which `is_node` knows by their names.
+pub fn wrong_with_components(
+    all: &BTreeMap<String, Vec<Component>>,
+    is_node: &dyn Fn(&String) -> bool,
+) -> Option<String> {
+    let loaded = all.values().map(Vec::len).sum::<usize>();
+    if loaded > MAX_NODES {
+        return Some(format!(
+            "it loads {loaded} nodes into others, and {MAX_NODES} are allowed at most"
+        ));
+    }
+    all.iter().find_map(|(container, components)| {
+        if !is_node(container) {
+            return Some(format!(
+                "it loads nodes into {container:?}, which it does not start"
+            ));
+        }
+        let problem = components.iter().find_map(wrong_with_component)?;
+        Some(format!("what is loaded into {container} {problem}"))
+    })
+}
+
+fn wrong_with_component(component: &Component) -> Option<String> {
+    if !names::is_package(&component.package) {
+        return Some(format!(
+            "is of package {:?}, which is not a valid name of a package",
+            component.package
+        ));
+    }
+    if !names::is_class(&component.plugin) {
+        return Some(format!(
+            "is {:?}, which is not a valid name of a class",
+            component.plugin
+        ));
+    }
+    let name = component.full_name();
+    if name.is_some_and(|name| !names::is_graph_name(&name)) {
+        return Some(format!(
+            "is named {:?} in {:?}, which are not valid for a ROS node",
+            component.name, component.namespace
+        ));
+    }
+    None
 }
 
 fn wrong_with_environment(environment: &BTreeMap<String, String>) -> Option<String> {
@@ -210,6 +259,41 @@ mod tests {
             .parameters
             .insert("relative".into(), ros::bus::ParamValue::Bool(true));
         assert!(check(&parameter).is_err());
+    }
+
+    #[test]
+    fn what_is_loaded_has_a_container_a_package_a_class_and_a_name() {
+        let component = Component {
+            package: "talk".into(),
+            plugin: "talk::Talker".into(),
+            name: "see".into(),
+            namespace: "/front".into(),
+            ..Component::default()
+        };
+        let loading = |container: &str, components: Vec<Component>| Answer {
+            components: [(container.to_owned(), components)].into(),
+            ..answer(vec![node()])
+        };
+        check(&loading("/a", vec![component.clone()])).expect("a plan");
+        type Change = fn(&mut Component);
+        let changes: [(&str, Change); 4] = [
+            ("package", |it| it.package = "../talk".into()),
+            ("class", |it| it.plugin = "talk::Talker;x".into()),
+            ("ROS node", |it| it.name = "see/$(x)".into()),
+            ("ROS node", |it| it.namespace = "/front rear".into()),
+        ];
+        for (words, change) in changes {
+            let mut bad = component.clone();
+            change(&mut bad);
+            let text = check(&loading("/a", vec![bad]))
+                .expect_err(words)
+                .to_string();
+            assert!(text.contains(words), "{text}");
+        }
+        let nowhere = check(&loading("/b", vec![component.clone()])).expect_err("nowhere");
+        assert!(nowhere.to_string().contains("does not start"), "{nowhere}");
+        let many = vec![component; MAX_NODES + 1];
+        assert!(check(&loading("/a", many)).is_err());
     }
 
     #[test]

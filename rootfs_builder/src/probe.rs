@@ -30,6 +30,7 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use ros::bus::{Bus, Graph, Qos, RosVersion, Subscription, TopicNodes, WireType};
 use ros::plumbing;
+use ros::ros2::composition::{Component, Container, NotLoaded};
 use ros::ros2::lifecycle::{self, Begun, NotBegun};
 use ros::schema::Registry;
 use tokio::sync::watch;
@@ -93,6 +94,9 @@ pub enum ProbeError {
     /// A node with a lifecycle does not begin its work.
     #[error(transparent)]
     Lifecycle(#[from] NotBegun),
+    /// A component container does not load a node.
+    #[error(transparent)]
+    Component(#[from] NotLoaded),
 }
 
 fn services(sought: &[String]) -> String {
@@ -118,6 +122,8 @@ pub struct ProbeOptions {
     /// At most so long for it to become still, each time; time that the nodes waited for a core does not count, up to
     /// `patience`.
     pub restless: Duration,
+    /// What is loaded into nodes that are component containers, by their names.
+    pub components: BTreeMap<String, Vec<Component>>,
     /// Types of topics as the deployer states them, for inputs that take any.
     pub types: BTreeMap<String, String>,
     /// Tells how much the nodes have worked: those that work have not settled (they load models, say), and those that
@@ -164,6 +170,7 @@ impl ProbeOptions {
             patience: Duration::from_secs(60),
             settle: Duration::from_millis(700),
             restless: Duration::from_secs(15),
+            components: BTreeMap::new(),
             types: BTreeMap::new(),
             work: None,
         }
@@ -222,6 +229,12 @@ async fn look(
     let mut watch = bus.graph();
     settle::registered(&mut watch, options).await?;
     tracing::debug!("probe: all nodes are registered");
+    let loaded = load_components(bus, registry, options).await?;
+    let options = &ProbeOptions {
+        nodes: options.nodes.iter().cloned().chain(loaded).collect(),
+        ..options.clone()
+    };
+    settle::registered(&mut watch, options).await?;
     let idle = begin_lifecycles(bus, &mut watch, options).await?;
     let bus = &**bus;
     let mut feed = Feed::begin(bus, registry, options).await;
@@ -284,6 +297,31 @@ async fn look(
     let grown = look.lengths.into_iter().filter(|(_, of)| of.is_growth());
     found.growing = grown.map(|(topic, _)| topic).collect();
     Ok(found)
+}
+
+/// Has containers load what is to be loaded into them, each its own and all at the same time: the names of those nodes.
+async fn load_components(
+    bus: &Arc<dyn Bus>,
+    registry: &Registry,
+    options: &ProbeOptions,
+) -> Result<Vec<String>, ProbeError> {
+    let loading = options
+        .components
+        .iter()
+        .map(|(name, components)| async move {
+            let no_definition = |problem| ProbeError::NoDefinition {
+                what: format!("container {name}"),
+                problem,
+            };
+            let container =
+                Container::of(Arc::clone(bus), registry, name).map_err(no_definition)?;
+            let loaded = container.load_all(components, options.patience).await;
+            loaded.map_err(ProbeError::from)
+        });
+    let loaded = futures_util::future::try_join_all(loading).await?;
+    let names = loaded.into_iter().flatten();
+    // Containers of others need not tell them.
+    Ok(names.filter(|name| !name.is_empty()).collect())
 }
 
 /// Has nodes configure and activate themselves that nobody else drives: before that they show nothing. What is to be said

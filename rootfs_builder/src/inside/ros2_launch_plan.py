@@ -11,6 +11,8 @@ import re
 import signal
 import tempfile
 
+import ros2_components as components
+
 # Seconds that a launch file may take.
 PATIENCE = 60
 # Files of parameters that launch_ros writes for a process that it is about to start.
@@ -72,11 +74,9 @@ def resolve(path, ask, plan, refused, give_up):
     if status != 0:
         said = [text.partition("(see debug for traceback): ")[2] or text for text in words.said]
         raise refused("launch", file=path, words="; ".join(said) or "launch ended with status %d" % status)
-    if recorder.components:
-        names = ", ".join(recorder.components)
-        raise refused(
-            "launch", file=path, words="it loads nodes into a container (%s): name their own programs with --node" % names
-        )
+    nowhere = recorder.contain()
+    if nowhere:
+        raise refused("launch", file=path, words=nowhere)
     recorder.tell_what_is_left(service)
     if not plan["nodes"]:
         raise refused("launch", file=path, words="the launch file starts no node")
@@ -88,8 +88,8 @@ class Recorder:
     def __init__(self, launch, launch_ros, plan):
         self.launch, self.launch_ros, self.plan = launch, launch_ros, plan
         self.before = dict(os.environ)
-        self.components = []
-        self.reactions = False
+        # Names of containers, each with what is loaded into it, in the order of loading.
+        self.loads = []
 
     def take_over(self):
         """Puts this in the place of what starts processes, waits, or talks to nodes."""
@@ -101,9 +101,8 @@ class Recorder:
             action.prepare(context)
             recorder.record(action, context)
 
-        def load(action, _context):
-            container = getattr(action, "_LoadComposableNodes__composable_node_descriptions", [])
-            recorder.components += [describe_component(one) for one in container]
+        def load(action, context):
+            recorder.load(action, context)
 
         def at_once(action, _context):
             recorder.plan["warnings"].append("what the launch file starts after a while is started with the rest")
@@ -119,6 +118,31 @@ class Recorder:
             kind = getattr(launch_ros.actions, name, None)
             if kind is not None:
                 kind.execute = instead
+
+    def load(self, action, context):
+        """Writes down what a container would be asked for: launch itself makes the requests."""
+        from launch_ros.actions.load_composable_nodes import get_composable_node_load_request as request
+
+        target = getattr(action, "_LoadComposableNodes__target_container")
+        is_action = isinstance(target, self.launch_ros.actions.Node)
+        name = target.node_name if is_action else self.text(target, context)
+        descriptions = getattr(action, "_LoadComposableNodes__composable_node_descriptions")
+        made = [request(one, context) for one in descriptions]
+        # Of one whose condition is not met there is none.
+        self.loads.append((name, [components.request_of(one) for one in made if one is not None]))
+
+    def contain(self):
+        """Puts what is loaded into the containers that are started; what is wrong with that, in words."""
+        names = [node["name"] for node in self.plan["nodes"] if node["named"]]
+        for target, requests in self.loads:
+            name = "/" + target.strip("/")
+            if name in names:
+                self.plan["components"].setdefault(name, []).extend(requests)
+            elif requests:
+                words = "it loads %s into %s, and starts no container of that name (it starts %s)"
+                plugins = ", ".join(one["plugin_name"] for one in requests)
+                return words % (plugins, name, ", ".join(names) or "none")
+        return None
 
     def record(self, action, context):
         process = action.process_description
@@ -190,11 +214,6 @@ class Recorder:
             words = "what the launch file does when a process ends is not done, but for respawn and shutdown"
             self.plan["warnings"].append(words)
         self.plan["warnings"] = list(dict.fromkeys(self.plan["warnings"]))
-
-
-def describe_component(description):
-    plugin = getattr(description, "node_plugin", None)
-    return "".join(getattr(one, "text", "?") for one in plugin) if isinstance(plugin, list) else str(plugin)
 
 
 def process_environment(environment, before):

@@ -15,6 +15,8 @@ import subprocess
 import sys
 import traceback
 
+import ros2_components as components
+
 ASK = "/cloudroid/ask.json"
 PLAN = "/cloudroid/out/plan.json"
 # How the environment that was made reaches this script when it is started again in it.
@@ -200,6 +202,15 @@ def find_executable(packages, asked):
     return None
 
 
+def find_component(packages, asked):
+    """Package and class of `CLASS`, in one of these packages, or of `PACKAGE/CLASS`, in any that the image has."""
+    package, slash, plugin = asked.partition("/")
+    for package, wanted in [(package, plugin)] if slash else [(package, asked) for package in packages]:
+        if wanted in components.classes_of(spaces(), package):
+            return package, wanted
+    return None
+
+
 def rules_of(arguments):
     """Arguments, those that name the node (as on the command line of ROS 1) told as ROS 2 takes them; and which they are."""
     names = {}
@@ -219,8 +230,12 @@ def from_executables(ask, plan, asked_nodes):
     for words in asked_nodes:
         asked, *arguments = shlex.split(words) or [words]
         found = find_executable(ask["packages"], asked)
+        component = None if found else find_component(ask["packages"], asked)
+        if component is not None:
+            contain(plan, *component, arguments, taken)
+            continue
         if found is None:
-            raise Refused("not_found", what="executable", name=asked, known=plan["executables"])
+            raise Refused("not_found", what="executable", name=asked, known=plan["executables"] + plan["components_known"])
         package, wanted, path = found
         arguments, given, namespace = rules_of(arguments)
         stem = given or stem_of(wanted)
@@ -234,21 +249,36 @@ def from_executables(ask, plan, asked_nodes):
         started.add(path)
         if named and name != given:
             arguments = arguments + ["--ros-args", "-r", "__node:=" + name]
-        plan["nodes"].append(
-            {
-                "name": (namespace or "").rstrip("/") + "/" + name,
-                "package": package,
-                "executable": wanted,
-                "argv": [path] + arguments,
-                "remaps": {},
-                "environment": {},
-                "directory": None,
-                "respawn": False,
-                "respawn_delay": 0.0,
-                "required": False,
-                "named": named,
-            }
-        )
+        name = (namespace or "").rstrip("/") + "/" + name
+        plan["nodes"].append(planned(name, package, wanted, [path] + arguments, named))
+
+
+def planned(name, package, executable, argv, named):
+    return {
+        "name": name,
+        "package": package,
+        "executable": executable,
+        "argv": argv,
+        "remaps": {},
+        "environment": {},
+        "directory": None,
+        "respawn": False,
+        "respawn_delay": 0.0,
+        "required": False,
+        "named": named,
+    }
+
+
+def contain(plan, package, plugin, arguments, taken):
+    """A class is loaded into a container of its own."""
+    path = executables_of(components.PACKAGE).get(components.PROGRAM)
+    if path is None:
+        raise Refused("no_container", plugin=plugin)
+    name = components.container_name(plugin, taken)
+    taken.add(name)
+    argv = [path, "--ros-args", "-r", "__node:=" + name]
+    plan["nodes"].append(planned("/" + name, components.PACKAGE, components.PROGRAM, argv, True))
+    plan["components"]["/" + name] = [components.of_command_line(package, plugin, arguments, Refused)]
 
 
 def stem_of(executable):
@@ -264,10 +294,12 @@ def can_launch():
 
 
 def make_plan(ask):
-    plan = {"nodes": [], "parameters": {}, "environment": {}, "warnings": [], "executables": [], "launch_files": []}
+    plan = {"nodes": [], "components": {}, "parameters": {}, "environment": {}, "warnings": []}
+    plan.update(executables=[], components_known=[], launch_files=[])
     plan["environment"] = json.loads(os.environ.pop(DIFFERENCE))
     for package in ask["packages"]:
         plan["executables"] += list(executables_of(package))
+        plan["components_known"] += components.classes_of(spaces(), package)
         plan["launch_files"] += launch_files_of(package)
     launch = ask["launch"]
     nodes = ask["nodes"]
@@ -276,8 +308,11 @@ def make_plan(ask):
             nodes = plan["executables"]
         elif len(plan["launch_files"]) == 1 and can_launch():
             launch = plan["launch_files"][0]
+        elif not plan["executables"] and len(plan["components_known"]) == 1:
+            nodes = plan["components_known"]
         else:
-            raise Refused("nothing", executables=plan["executables"], launch_files=plan["launch_files"])
+            known = plan["executables"] + plan["components_known"]
+            raise Refused("nothing", executables=known, launch_files=plan["launch_files"])
     if launch:
         import ros2_launch_plan
 
@@ -288,6 +323,9 @@ def make_plan(ask):
         for source, target in ask["remaps"].items():
             node["argv"] += ["--ros-args", "-r", "%s:=%s" % (source, target), "--"]
             node["remaps"][source] = target
+    for loaded in plan["components"].values():
+        for component in loaded:
+            components.give(component, ask, Refused)
     for name, value in ask["params"].items():
         if name.startswith("/"):
             plan["parameters"][name] = value

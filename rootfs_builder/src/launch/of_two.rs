@@ -7,12 +7,12 @@ use std::process::Command;
 use super::*;
 
 /// What an image holds, and what is asked.
-struct Lab {
+pub(super) struct Lab {
     root: tempfile::TempDir,
 }
 
 impl Lab {
-    fn new() -> Self {
+    pub(super) fn new() -> Self {
         let lab = Self {
             root: tempfile::tempdir().expect("a directory"),
         };
@@ -27,11 +27,11 @@ impl Lab {
         lab
     }
 
-    fn path(&self, path: &str) -> PathBuf {
+    pub(super) fn path(&self, path: &str) -> PathBuf {
         self.root.path().join(path)
     }
 
-    fn write(&self, path: &str, text: &str, mode: u32) {
+    pub(super) fn write(&self, path: &str, text: &str, mode: u32) {
         let path = self.path(path);
         fs::create_dir_all(path.parent().expect("below")).expect("made");
         fs::write(&path, text).expect("written");
@@ -39,7 +39,7 @@ impl Lab {
     }
 
     /// An installed package with these programs.
-    fn package(&self, prefix: &str, name: &str, programs: &[&str]) {
+    pub(super) fn package(&self, prefix: &str, name: &str, programs: &[&str]) {
         let index = format!("{prefix}/share/ament_index/resource_index/packages/{name}");
         self.write(&index, "", 0o644);
         self.write(&format!("{prefix}/share/{name}/package.xml"), "", 0o644);
@@ -52,7 +52,7 @@ impl Lab {
         }
     }
 
-    fn ask(&self, ask: &Ask) -> Result<Answer, Error> {
+    pub(super) fn ask(&self, ask: &Ask) -> Result<Answer, Error> {
         let question = serde_json::to_string(ask).expect("JSON");
         self.write("cloudroid/ask.json", &question, 0o644);
         let (first, _) = scripts(Version::Ros2)[0];
@@ -71,7 +71,7 @@ impl Lab {
         Ok(answer)
     }
 
-    fn of(&self, prefix: &str, nodes: &[&str]) -> Ask {
+    pub(super) fn of(&self, prefix: &str, nodes: &[&str]) -> Ask {
         Ask {
             packages: vec!["talk".to_owned()],
             prefix: self.path(prefix).display().to_string(),
@@ -81,7 +81,7 @@ impl Lab {
     }
 }
 
-fn argv(answer: &Answer, index: usize) -> Vec<&str> {
+pub(super) fn argv(answer: &Answer, index: usize) -> Vec<&str> {
     let words = answer.nodes[index].argv.iter().skip(1);
     words.map(String::as_str).collect()
 }
@@ -265,8 +265,10 @@ fn a_space_for_another_python_is_refused() {
 }
 
 /// What an expression of the second script's module is.
-fn evaluated(lab: &Lab, expression: &str) -> String {
-    let code = format!("from ros2_launch_plan import *; print({expression})");
+pub(super) fn evaluated(lab: &Lab, expression: &str) -> String {
+    let code = format!(
+        "from ros2_launch_plan import *; import ros2_components as components; print({expression})"
+    );
     let said = Command::new("/usr/bin/python3")
         .args(["-c", &code])
         .current_dir(lab.path("cloudroid"))

@@ -12,8 +12,11 @@ use tokio::net::TcpListener;
 use super::*;
 
 mod feeding;
+mod loading;
 #[path = "../../../tests/support/memory_bus.rs"]
 mod memory_bus;
+#[path = "../../../tests/support/memory_container.rs"]
+mod memory_container;
 mod of_two;
 
 const STRING: (&str, &str) = ("std_msgs/msg/String", "string data\n");

@@ -47,7 +47,8 @@ pub struct Push {
     launch: Option<String>,
     /// Executable to run (EXE, or PACKAGE/EXE), its arguments behind it in one pair of quotes: --node
     /// 'topic_tools/relay /in /out'; may be given several times. The node has its program's own name, as under rosrun or
-    /// ros2 run; __name:=NAME (in ROS 2 __node:=NAME, too) gives it another.
+    /// ros2 run; __name:=NAME (in ROS 2 __node:=NAME, too) gives it another. In ROS 2 also the class of a component
+    /// (talkers::Talker, or PACKAGE/CLASS), with remaps and -p NAME:=VALUE behind it: it gets a container of its own.
     #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
     /// Private parameter of the nodes, or a global one (/K=V); may be given several times.

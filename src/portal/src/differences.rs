@@ -122,6 +122,15 @@ fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
             );
         }
     }
+    for (container, components) in &of.plan.components {
+        for (index, component) in components.iter().enumerate() {
+            let name = component.full_name();
+            let name =
+                name.unwrap_or_else(|| format!("{} (number {})", component.plugin, index + 1));
+            let loaded = serde_json::to_string(component).unwrap_or_default();
+            add(Part::Node, &format!("{container} loads {name}"), loaded, 0);
+        }
+    }
     for (variable, value) in &of.plan.environment {
         add(Part::Environment, variable, "set".to_owned(), hash(value));
     }

@@ -13,7 +13,9 @@ use image::Received;
 use package::interface::Interface;
 use package::inventory::{Inventory, Published};
 use package::names::{is_graph_name, is_package};
-use rootfs_builder::{BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking};
+use rootfs_builder::{
+    BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, wrong_with_components,
+};
 use ros::flavour::Flavour;
 use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
@@ -126,6 +128,10 @@ impl ServiceRecord {
         environment(&self.plan.environment)?;
         for node in &self.plan.nodes {
             check_node(node)?;
+        }
+        let is_node = |name: &String| self.plan.nodes.iter().any(|node| node.name == *name);
+        if let Some(problem) = wrong_with_components(&self.plan.components, &is_node) {
+            return Err(problem);
         }
         if let Some(name) = self
             .plan
@@ -313,6 +319,7 @@ fn take_in(
         plan: LaunchPlan {
             nodes,
             parameters: record.plan.parameters.clone(),
+            components: record.plan.components.clone(),
         },
         inventory,
         hold,

@@ -384,6 +384,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
         environment,
         nodes,
         parameters: built.plan.parameters.clone(),
+        components: built.plan.components.clone(),
         limits: options.limits,
         caps: options.caps,
         sla: options.sla,

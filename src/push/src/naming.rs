@@ -16,6 +16,7 @@ use rootfs_builder::probe::ProbeError;
 use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use ros::plumbing;
+use ros::ros2::composition::Component;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
 use tokio::sync::watch;
@@ -273,7 +274,10 @@ pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) 
         key.strip_prefix(name)
             .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
     };
-    let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
+    let loaded = plan.components.values().flatten();
+    let loaded: Vec<String> = loaded.filter_map(Component::full_name).collect();
+    let names = plan.nodes.iter().map(|node| node.name.as_str());
+    let names: Vec<&str> = names.chain(loaded.iter().map(String::as_str)).collect();
     let mut warnings = Vec::new();
     for key in options.params.keys() {
         // `/rate` is everybody's.

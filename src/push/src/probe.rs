@@ -163,6 +163,7 @@ async fn look(
             .as_deref()
             .map(supplement::topic_types)
             .unwrap_or_default(),
+        components: plan.components.clone(),
         work: Some(Work::new(move || worked(Arc::clone(&working)))),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),

@@ -13,6 +13,7 @@ use ros::schema::Registry;
 use ros::sizes::Seen;
 use tokio::sync::watch;
 
+use crate::components::{Components, Loads};
 use crate::inside::{Inside, Joining, Looked};
 use crate::lifecycle::{Lifecycles, Stages};
 use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
@@ -30,6 +31,7 @@ pub(crate) struct InProcess {
     /// What the robot's stubs have started.
     nodes: Arc<dyn Nodes>,
     lifecycles: Option<Lifecycles>,
+    components: Option<Components>,
     /// What must be there while this is.
     _keeps: Box<dyn Any + Send + Sync>,
 }
@@ -46,6 +48,7 @@ pub(crate) struct Behind {
     pub(crate) inside: Joining,
     pub(crate) registry: Arc<Registry>,
     pub(crate) lifecycles: Option<Lifecycles>,
+    pub(crate) components: Option<Components>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,
 }
 
@@ -58,6 +61,7 @@ impl InProcess {
             inside,
             registry,
             lifecycles,
+            components,
             keeps,
         } = behind;
         let tap = Arc::new(Tap::default());
@@ -93,6 +97,7 @@ impl InProcess {
             hub,
             nodes,
             lifecycles,
+            components,
             _keeps: keeps,
         }
     }
@@ -134,6 +139,10 @@ impl Reach for InProcess {
 
     fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
         self.lifecycles.as_ref().map(Lifecycles::stages)
+    }
+
+    fn loads(&self) -> Option<watch::Receiver<Loads>> {
+        self.components.as_ref().map(Components::loads)
     }
 
     async fn linked(&self) -> Vec<Linked> {

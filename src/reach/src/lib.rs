@@ -13,8 +13,10 @@
 
 #![forbid(unsafe_code)]
 
+pub mod components;
 pub mod egress;
 mod ends;
+mod following;
 pub mod group;
 mod in_process;
 mod inside;
@@ -22,6 +24,12 @@ pub mod lifecycle;
 pub mod links;
 mod local;
 pub mod master;
+#[cfg(test)]
+#[path = "../../../tests/support/memory_bus.rs"]
+mod memory_bus;
+#[cfg(test)]
+#[path = "../../../tests/support/memory_container.rs"]
+mod memory_container;
 mod nodes;
 pub mod readiness;
 mod request_times;
@@ -43,6 +51,7 @@ use package::interface::Interface;
 use package::inventory::Inventory;
 use ros::bus::{Bus, BusError, Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
+use ros::ros2::composition::Component;
 use ros::schema::Registry;
 use ros::sizes::Seen;
 use servant::engine::Servant;
@@ -50,6 +59,7 @@ use servant::spec::NodeSpec;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
+use components::Loads;
 use egress::Relays;
 use lifecycle::Stages;
 use links::LinkStatus;
@@ -77,6 +87,8 @@ pub struct Recorded {
     pub nodes: Vec<NodeSpec>,
     /// Parameters that the deployer gave, absolute names.
     pub parameters: BTreeMap<String, ParamValue>,
+    /// What is loaded into nodes that are component containers, by their names.
+    pub components: BTreeMap<String, Vec<Component>>,
     /// What the image holds.
     pub inventory: Arc<Inventory>,
     /// Message definitions.
@@ -177,6 +189,10 @@ pub trait Reach: Send + Sync + 'static {
     fn links(&self) -> Vec<LinkStatus>;
     /// Where its nodes are that have a lifecycle, now and later; none where its ROS knows none.
     fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
+        None
+    }
+    /// How far its component containers are, now and later; none where nothing is loaded into any.
+    fn loads(&self) -> Option<watch::Receiver<Loads>> {
         None
     }
     /// Nodes that stubs have started and that run.

@@ -7,17 +7,17 @@
 //!                                                   └─▶ configure ─▶ activate ─▶ or the event lifecycle-refused ─▶ state
 //! ```
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ros::bus::{Bus, RosVersion};
 use ros::ros2::lifecycle::{Begun, LifecycleNode, State};
 use tokio::sync::watch;
-use tokio::task::{AbortHandle, JoinSet};
+use tokio::task::AbortHandle;
 
-use crate::Observer;
 use crate::links::Nodes;
+use crate::{Observer, following};
 
 /// For one transition: nodes load what they need then.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -87,38 +87,10 @@ struct Followed {
 
 impl Followed {
     async fn run(self: Arc<Self>) {
-        let mut graph = self.bus.graph();
-        // By name and address: a node that was started again begins again.
-        let mut known: HashMap<(String, String), AbortHandle> = HashMap::new();
-        // They end with this.
-        let mut tasks = JoinSet::new();
-        loop {
-            let now = Arc::clone(&graph.borrow_and_update());
-            let there = LifecycleNode::all(&now).into_iter().filter_map(|node| {
-                let address = now.nodes.get(&node)?.clone();
-                (node != self.bus.node()).then_some((node, address))
-            });
-            let there: Vec<_> = there.collect();
-            known.retain(|one, task| {
-                let stays = there.contains(one);
-                if !stays {
-                    task.abort();
-                    self.shown.send_modify(|all| drop(all.remove(&one.0)));
-                }
-                stays
-            });
-            while tasks.try_join_next().is_some() {}
-            for one in there {
-                let node = one.0.clone();
-                let followed = &self;
-                known
-                    .entry(one)
-                    .or_insert_with(|| tasks.spawn(Arc::clone(followed).one(node)));
-            }
-            if graph.changed().await.is_err() {
-                return;
-            }
-        }
+        let begin = |node: String| Arc::clone(&self).one(node);
+        let gone = |node: &str| self.shown.send_modify(|all| drop(all.remove(node)));
+        let (graph, ours) = (self.bus.graph(), self.bus.node());
+        following::each_node(graph, ours, LifecycleNode::all, begin, gone).await;
     }
 
     /// Has one node begin, if that is ours to do, and tells its states from then on.

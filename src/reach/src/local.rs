@@ -10,6 +10,7 @@ use ros::bus::RosVersion;
 use servant::engine::Servant;
 use servant::local::{LocalEngine, LocalServant};
 
+use crate::components::{Components, Wanted};
 use crate::egress::{self, Relays};
 use crate::in_process::{Behind, InProcess};
 use crate::lifecycle::Lifecycles;
@@ -74,9 +75,11 @@ impl Opener for LocalOpener {
         let bus = bus?;
         let registry = Arc::clone(&recorded.registry);
         let relays = self.relays(&local, &recorded.egress).await;
+        let wanted = Wanted::new(recorded.components.clone(), Arc::clone(&registry));
         let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
         let nodes: Arc<dyn Nodes> = Arc::new(nodes);
         let lifecycles = Lifecycles::follow(&bus, &nodes, &observer);
+        let components = Components::follow(&bus, &nodes, &observer, wanted);
         let behind = Behind {
             id: servant.id().to_owned(),
             linked: (Arc::clone(&bus), nodes),
@@ -86,6 +89,7 @@ impl Opener for LocalOpener {
             }),
             registry,
             lifecycles,
+            components,
             keeps: Box::new(relays),
         };
         Ok(Arc::new(InProcess::new(behind, options)))

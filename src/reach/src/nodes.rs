@@ -286,6 +286,7 @@ mod tests {
             environment: Default::default(),
             nodes: Vec::new(),
             parameters: Default::default(),
+            components: Default::default(),
             inventory: Arc::new(Inventory {
                 programs: [
                     ("see", "/opt/mine/lib/vision/see"),

@@ -135,6 +135,7 @@ fn recorded() -> Recorded {
         environment: Default::default(),
         nodes: vec![serde_json::from_value(node).unwrap()],
         parameters: Default::default(),
+        components: Default::default(),
         inventory: Arc::new(Inventory {
             programs: [("worker".into(), "/opt/lib/works/worker".into())].into(),
             ..Inventory::default()

@@ -4,6 +4,7 @@ mod actions;
 mod bus;
 mod calls;
 mod client;
+pub mod composition;
 mod ends;
 mod entities;
 mod graph;

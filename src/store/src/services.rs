@@ -60,6 +60,9 @@ pub struct Plan {
     /// Parameters set before the first node starts, absolute names.
     #[serde(default)]
     pub parameters: BTreeMap<String, ros::bus::ParamValue>,
+    /// What is loaded into nodes that are component containers (ROS 2), by their names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub components: BTreeMap<String, Vec<ros::ros2::composition::Component>>,
     /// Limits that the push asked for.
     #[serde(default)]
     pub limits: api::Limits,

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use api::Phase;
 use package::interface::Interface;
 use reach::Reach;
+use reach::components::{Load, Loads};
 use reach::lifecycle::Stages;
 use reach::readiness::{missing, missing_nodes};
 use tokio::sync::watch;
@@ -26,15 +27,23 @@ pub(super) async fn interface_there(
     let interface: &Interface = &handle.revision.interface;
     let image = &handle.revision.image;
     let mut graphs = reach.graph();
-    let mut lifecycles = reach.lifecycles();
+    let (mut lifecycles, mut loads) = (reach.lifecycles(), reach.loads());
     let mut changed = Instant::now();
     loop {
         let graph = graphs.borrow_and_update().clone();
         if let Some(refused) = lifecycles.as_mut().and_then(refused) {
             return Err(Failure::broken(format!("is of no use: {refused}")));
         }
-        let missing = missing(interface, &graph);
-        let nodes_missing = missing_nodes(interface, &graph);
+        let loading = match loads.as_mut().map(still_loading) {
+            Some(Err(refused)) => return Err(Failure::broken(format!("is of no use: {refused}"))),
+            loading => loading.and_then(Result::ok).unwrap_or_default(),
+        };
+        let mut missing = missing(interface, &graph);
+        let mut nodes_missing = missing_nodes(interface, &graph);
+        for container in loading {
+            missing.push(format!("what is loaded into {container}"));
+            nodes_missing.push(format!("the nodes of {container}"));
+        }
         let shown = Shown {
             missing: &missing,
             nodes_missing: &nodes_missing,
@@ -65,7 +74,8 @@ pub(super) async fn interface_there(
                 Err(_) => {}
             },
             // A node that becomes active is about to show more.
-            () = stage_changed(&mut lifecycles) => changed = Instant::now(),
+            () = changes(&mut lifecycles) => changed = Instant::now(),
+            () = changes(&mut loads) => changed = Instant::now(),
         }
     }
 }
@@ -76,13 +86,24 @@ fn refused(stages: &mut watch::Receiver<Stages>) -> Option<String> {
     stages.values().find_map(|stage| stage.refused.clone())
 }
 
-async fn stage_changed(stages: &mut Option<watch::Receiver<Stages>>) {
-    let changed = match stages {
-        Some(stages) => stages.changed().await,
+/// Containers that have not loaded all of their nodes; else why one does not load one.
+fn still_loading(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>, String> {
+    let loads = loads.borrow_and_update();
+    let loading = loads.iter().filter_map(|(container, load)| match load {
+        Load::Loading => Some(Ok(container.clone())),
+        Load::Refused(why) => Some(Err(why.clone())),
+        Load::Loaded(_) => None,
+    });
+    loading.collect()
+}
+
+async fn changes<T>(of: &mut Option<watch::Receiver<T>>) {
+    let changed = match of {
+        Some(of) => of.changed().await,
         None => return std::future::pending().await,
     };
     if changed.is_err() {
-        *stages = None;
+        *of = None;
     }
 }
 

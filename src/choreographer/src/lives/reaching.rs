@@ -131,6 +131,7 @@ pub(crate) fn recorded(revision: &RevisionRecord, known: Known) -> Recorded {
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         parameters: plan.parameters.clone(),
+        components: plan.components.clone(),
         inventory,
         registry,
         egress: plan.grants.egress.clone(),

@@ -258,6 +258,7 @@ mod tests {
             environment: Default::default(),
             nodes: nodes.expect("nodes"),
             parameters: BTreeMap::from([("/cook/salt".to_owned(), ParamValue::Int(3))]),
+            components: Default::default(),
             inventory: Arc::new(Inventory {
                 programs: ["cook", "wash"]
                     .map(|name| (name.to_owned(), format!("/opt/mine/lib/kitchen/{name}")))

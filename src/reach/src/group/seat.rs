@@ -34,6 +34,7 @@ pub fn seat(
         registry,
         // Those of its servants are looked after there.
         lifecycles: None,
+        components: None,
         keeps: Box::new(()),
     };
     Arc::new(InProcess::new(behind, options))

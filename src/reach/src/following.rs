@@ -1,0 +1,133 @@
+//! Tasks beside nodes of a servant: one for each node that is of interest, for as long as it is there.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use ros::bus::Graph;
+use tokio::sync::watch;
+use tokio::task::{AbortHandle, JoinSet};
+
+/// Begins a task for each node that `of_interest` names, when it appears, and ends it when the node is gone, which `gone` is then
+/// told; but for the node that is `ours`. Comes back when the graph is not told any more; dropping this ends all tasks.
+pub(crate) async fn each_node<F>(
+    mut graph: watch::Receiver<Arc<Graph>>,
+    ours: &str,
+    of_interest: impl Fn(&Graph) -> Vec<String>,
+    begin: impl Fn(String) -> F,
+    gone: impl Fn(&str),
+) where
+    F: Future<Output = ()> + Send + 'static,
+{
+    // By name and address: a node that was started again begins again.
+    let mut known: HashMap<(String, String), AbortHandle> = HashMap::new();
+    // They end with this.
+    let mut tasks = JoinSet::new();
+    loop {
+        let now = Arc::clone(&graph.borrow_and_update());
+        let there = of_interest(&now).into_iter().filter_map(|node| {
+            let address = now.nodes.get(&node)?.clone();
+            (node != ours).then_some((node, address))
+        });
+        let there: Vec<_> = there.collect();
+        known.retain(|one, task| {
+            let stays = there.contains(one);
+            if !stays {
+                task.abort();
+                gone(&one.0);
+            }
+            stays
+        });
+        while tasks.try_join_next().is_some() {}
+        for one in there {
+            let node = one.0.clone();
+            known.entry(one).or_insert_with(|| tasks.spawn(begin(node)));
+        }
+        if graph.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use tokio::sync::mpsc;
+    use tokio::time::timeout;
+
+    use super::*;
+
+    /// Only bounds how long a failing test takes.
+    const LONG: Duration = Duration::from_secs(60);
+
+    fn graph(nodes: &[(&str, &str)]) -> Arc<Graph> {
+        let nodes = nodes.iter();
+        let nodes = nodes.map(|(name, address)| ((*name).to_owned(), (*address).to_owned()));
+        Arc::new(Graph {
+            nodes: nodes.collect(),
+            ..Graph::default()
+        })
+    }
+
+    /// Tells its end.
+    struct Runs(String, mpsc::UnboundedSender<String>);
+
+    impl Drop for Runs {
+        fn drop(&mut self) {
+            let _ = self.1.send(format!("ended {}", self.0));
+        }
+    }
+
+    #[tokio::test]
+    async fn a_node_that_was_started_again_begins_again() {
+        let shown = watch::Sender::new(graph(&[("/ours", "1"), ("/box", "1"), ("/other", "1")]));
+        let (sender, mut told) = mpsc::unbounded_channel();
+        let (seen, begun, left) = (shown.subscribe(), sender.clone(), sender);
+        let following = tokio::spawn(async move {
+            let of_interest = |graph: &Graph| {
+                let nodes = graph.nodes.keys();
+                nodes.filter(|name| *name != "/other").cloned().collect()
+            };
+            let begin = |node: String| {
+                let runs = Runs(node, begun.clone());
+                async move {
+                    let _ = runs.1.send(format!("began {}", runs.0));
+                    std::future::pending().await
+                }
+            };
+            let gone = |node: &str| {
+                let _ = left.send(format!("gone {node}"));
+            };
+            each_node(seen, "/ours", of_interest, begin, gone).await;
+        });
+        let mut next = async |count: usize| {
+            let mut heard = Vec::new();
+            while heard.len() < count {
+                heard.push(
+                    timeout(LONG, told.recv())
+                        .await
+                        .expect("told")
+                        .expect("open"),
+                );
+            }
+            heard.sort();
+            heard
+        };
+        assert_eq!(next(1).await, ["began /box"]);
+        // Another address is another process.
+        shown.send_replace(graph(&[("/box", "2")]));
+        assert_eq!(next(3).await, ["began /box", "ended /box", "gone /box"]);
+        shown.send_replace(graph(&[("/box", "2"), ("/late", "1")]));
+        assert_eq!(next(1).await, ["began /late"]);
+        shown.send_replace(graph(&[]));
+        assert_eq!(
+            next(4).await,
+            ["ended /box", "ended /late", "gone /box", "gone /late"]
+        );
+        drop(shown);
+        timeout(LONG, following)
+            .await
+            .expect("it ends")
+            .expect("it does not panic");
+    }
+}

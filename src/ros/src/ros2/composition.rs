@@ -1,0 +1,342 @@
+//! Nodes that are loaded into one process with others: a component container serves what loads them
+//! (`composition_interfaces/srv/LoadNode`; <https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Composition.html>).
+//!
+//! ```text
+//!  container ──serves load_node?──▶ list_nodes ──▶ load_node, one after the other, of those that it has not ──▶ names
+//!                  └─ not in time ─────────────────────────┴─ says no ─▶ NotLoaded
+//! ```
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use tokio::time::timeout;
+
+use crate::bus::{Bus, BusError, Graph, ServiceType};
+use crate::codec::{CodecError, FillOptions, JsonOptions, from_json, to_json};
+use crate::schema::{MessageType, Registry, SchemaError, ServiceDef};
+
+/// The service that loads a node.
+const LOAD: &str = "composition_interfaces/srv/LoadNode";
+/// The one that tells which are loaded.
+const LIST: &str = "composition_interfaces/srv/ListNodes";
+/// Types that must be defined where nodes are to be loaded; how is up to the image.
+pub const SERVICES: [&str; 2] = [LOAD, LIST];
+
+/// A node that is to be loaded. As JSON it is the request of `composition_interfaces/srv/LoadNode`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Component {
+    /// The package that has registered it.
+    #[serde(rename = "package_name")]
+    pub package: String,
+    /// Its class, such as `talkers::Talker`.
+    #[serde(rename = "plugin_name")]
+    pub plugin: String,
+    /// What it is called; empty: what it calls itself.
+    #[serde(rename = "node_name", default)]
+    pub name: String,
+    /// Where it is; empty: where it puts itself.
+    #[serde(rename = "node_namespace", default)]
+    pub namespace: String,
+    /// `FROM:=TO`.
+    #[serde(default)]
+    pub remap_rules: Vec<String>,
+    /// Each a `rcl_interfaces/msg/Parameter`.
+    #[serde(default)]
+    pub parameters: Vec<Value>,
+    /// For the container: each a `rcl_interfaces/msg/Parameter`.
+    #[serde(default)]
+    pub extra_arguments: Vec<Value>,
+}
+
+impl Component {
+    /// Its absolute name; none where its program says it.
+    pub fn full_name(&self) -> Option<String> {
+        let renamed = self.remap_rules.iter().any(|rule| rule.starts_with("__"));
+        let known = !self.name.is_empty() && !renamed;
+        let above = self.namespace.trim_matches('/');
+        known.then(|| match above {
+            "" => format!("/{}", self.name),
+            above => format!("/{above}/{}", self.name),
+        })
+    }
+}
+
+/// Why a container has not loaded a node.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("the component container {container} does not load {}: {reason}", shown(.name, .plugin, .package))]
+pub struct NotLoaded {
+    /// The container's absolute name.
+    pub container: String,
+    /// The node's absolute name, as far as it is known.
+    pub name: Option<String>,
+    /// Its class.
+    pub plugin: String,
+    /// The class's package.
+    pub package: String,
+    /// What the container said, or what kept it from saying anything.
+    pub reason: String,
+}
+
+fn shown(name: &Option<String>, plugin: &str, package: &str) -> String {
+    let class = format!("{plugin} of package {package}");
+    match name {
+        Some(name) => format!("{name} ({class})"),
+        None => class,
+    }
+}
+
+/// A process that nodes are loaded into.
+pub struct Container {
+    bus: Arc<dyn Bus>,
+    node: String,
+    load: Arc<ServiceDef>,
+    list: Arc<ServiceDef>,
+}
+
+impl Container {
+    /// The one of this absolute name, by the definitions of its image.
+    ///
+    /// # Errors
+    /// The image has none of `composition_interfaces`.
+    pub fn of(bus: Arc<dyn Bus>, registry: &Registry, node: &str) -> Result<Self, SchemaError> {
+        Ok(Self {
+            bus,
+            node: node.to_owned(),
+            load: registry.service(LOAD)?,
+            list: registry.service(LIST)?,
+        })
+    }
+
+    /// Loads these in their order, but for those that are loaded already: their absolute names. The container may take as long as
+    /// `patience` to serve what loads them, and then for each of them: some load what they need when they are made.
+    ///
+    /// # Errors
+    /// The first one that is not loaded; those behind it are not tried.
+    pub async fn load_all(
+        &self,
+        components: &[Component],
+        patience: Duration,
+    ) -> Result<Vec<String>, NotLoaded> {
+        let Some(first) = components.first() else {
+            return Ok(Vec::new());
+        };
+        let served = self.served(patience).await;
+        let there = match served {
+            Ok(()) => self.loaded(patience).await,
+            Err(reason) => Err(reason),
+        };
+        let there = there.map_err(|reason| self.not_loaded(first, reason))?;
+        let mut names = there.clone();
+        for component in left(components, there) {
+            let loaded = self.load(component, patience).await;
+            names.push(loaded.map_err(|reason| self.not_loaded(component, reason))?);
+        }
+        Ok(names)
+    }
+
+    fn service(&self, part: &str) -> String {
+        format!("{}/_container/{part}", self.node)
+    }
+
+    async fn served(&self, patience: Duration) -> Result<(), String> {
+        let service = self.service("load_node");
+        // What tools hide is among the ends alone.
+        let there = |graph: &Arc<Graph>| {
+            let ends = graph.ends.get(&self.node);
+            ends.is_some_and(|ends| ends.services.contains_key(&service))
+        };
+        let mut graph = self.bus.graph();
+        match timeout(patience, graph.wait_for(there)).await {
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(_)) => Err(BusError::Closed.to_string()),
+            Err(_) => Err(format!(
+                "it did not serve {service} within {patience:?}: it is no component container, or waits for something (see its log)"
+            )),
+        }
+    }
+
+    /// Names of the nodes that it has loaded, in the order in which it has.
+    async fn loaded(&self, patience: Duration) -> Result<Vec<String>, String> {
+        let answer = match self.ask("list_nodes", &self.list, b"{}", patience).await {
+            Ok(answer) => answer,
+            // One that does not tell was made by somebody else, and has begun just now.
+            Err(Asked::Bus(BusError::NoService(_))) => return Ok(Vec::new()),
+            Err(other) => return Err(other.to_string()),
+        };
+        let names = answer["full_node_names"].as_array();
+        let names = names.into_iter().flatten().filter_map(Value::as_str);
+        Ok(names.map(str::to_owned).collect())
+    }
+
+    async fn load(&self, component: &Component, patience: Duration) -> Result<String, String> {
+        let request = serde_json::to_vec(component).unwrap_or_default();
+        let asked = self.ask("load_node", &self.load, &request, patience).await;
+        let answer = asked.map_err(|error| error.to_string())?;
+        let text = |field: &str| answer[field].as_str().unwrap_or_default().to_owned();
+        match (answer["success"].as_bool(), text("error_message")) {
+            (Some(true), _) => Ok(text("full_node_name")),
+            (_, words) if words.is_empty() => Err("it does not say why (see its log)".to_owned()),
+            (_, words) => Err(words),
+        }
+    }
+
+    /// Calls once: the answer as JSON.
+    async fn ask(
+        &self,
+        part: &str,
+        of: &ServiceDef,
+        request: &[u8],
+        patience: Duration,
+    ) -> Result<Value, Asked> {
+        let mut bytes = Vec::new();
+        from_json(&of.request, request, &mut bytes, &FillOptions::default())?;
+        let (service, digest) = (self.service(part), ServiceType::of(of).digest);
+        let answer = self
+            .bus
+            .call_typed(&service, &digest, bytes.into(), patience);
+        read(&of.response, &answer.await?)
+    }
+
+    fn not_loaded(&self, component: &Component, reason: String) -> NotLoaded {
+        NotLoaded {
+            container: self.node.clone(),
+            name: component.full_name(),
+            plugin: component.plugin.clone(),
+            package: component.package.clone(),
+            reason,
+        }
+    }
+}
+
+/// Those that are not among the names that are there. A name that none of them has by itself is one that a node gave itself: of those
+/// the first ones were loaded.
+fn left(components: &[Component], mut there: Vec<String>) -> Vec<&Component> {
+    let mut take = |name: &String| {
+        let found = there.iter().position(|other| other == name);
+        found.map(|at| there.swap_remove(at)).is_some()
+    };
+    let mut left: Vec<&Component> = components.iter().collect();
+    left.retain(|component| !component.full_name().is_some_and(|name| take(&name)));
+    let mut others = there.len();
+    left.retain(|component| {
+        let is_there = others > 0 && component.full_name().is_none();
+        others -= usize::from(is_there);
+        !is_there
+    });
+    left
+}
+
+#[derive(Debug, thiserror::Error)]
+enum Asked {
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    #[error(transparent)]
+    Codec(#[from] CodecError),
+    #[error("its answer is no JSON: {0}")]
+    Json(#[from] serde_json::Error),
+}
+
+fn read(of: &MessageType, answer: &Bytes) -> Result<Value, Asked> {
+    let mut json = Vec::new();
+    to_json(of, answer, &mut json, &JsonOptions::default())?;
+    Ok(serde_json::from_slice(&json)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn component(name: &str, namespace: &str) -> Component {
+        Component {
+            package: "talkers".to_owned(),
+            plugin: "talkers::Talker".to_owned(),
+            name: name.to_owned(),
+            namespace: namespace.to_owned(),
+            ..Component::default()
+        }
+    }
+
+    #[test]
+    fn a_node_is_called_as_the_request_says_or_as_nobody_knows() {
+        for (name, namespace, expected) in [
+            ("see", "", Some("/see")),
+            ("see", "/", Some("/see")),
+            ("see", "/front/left", Some("/front/left/see")),
+            ("", "/front", None),
+        ] {
+            let told = component(name, namespace).full_name();
+            assert_eq!(told.as_deref(), expected, "{name} {namespace}");
+        }
+        let mut renamed = component("see", "");
+        renamed.remap_rules.push("__node:=look".to_owned());
+        assert_eq!(renamed.full_name(), None);
+    }
+
+    #[test]
+    fn what_is_loaded_is_not_loaded_again() {
+        let all = [
+            component("a", ""),
+            component("", ""),
+            component("b", "/x"),
+            component("", ""),
+        ];
+        let still = |there: &[&str]| {
+            let there = there.iter().map(|&name| name.to_owned()).collect();
+            let left = left(&all, there).into_iter();
+            left.map(|one| one.full_name()).collect::<Vec<_>>()
+        };
+        let (a, b) = (Some("/a".to_owned()), Some("/x/b".to_owned()));
+        assert_eq!(still(&[]), [a.clone(), None, b.clone(), None]);
+        assert_eq!(still(&["/a"]), [None, b.clone(), None]);
+        assert_eq!(still(&["/a", "/said_itself"]), [b, None]);
+        assert_eq!(still(&["/x/b", "/one", "/two"]), [a]);
+        assert!(still(&["/a", "/x/b", "/one", "/two", "/more"]).is_empty());
+    }
+
+    #[test]
+    fn a_request_is_the_component_and_nothing_else() {
+        let mut component = component("see", "/front");
+        component.parameters = vec![json!({"name": "rate", "value": {"type": 2}})];
+        let text = serde_json::to_value(&component).expect("JSON");
+        let expected = json!({
+            "package_name": "talkers",
+            "plugin_name": "talkers::Talker",
+            "node_name": "see",
+            "node_namespace": "/front",
+            "remap_rules": [],
+            "parameters": [{"name": "rate", "value": {"type": 2}}],
+            "extra_arguments": [],
+        });
+        assert_eq!(text, expected);
+        let more = json!({"package_name": "p", "plugin_name": "p::C", "shell": "x"});
+        assert!(serde_json::from_value::<Component>(more).is_err());
+    }
+
+    #[test]
+    fn what_is_not_loaded_is_told_by_node_and_class() {
+        let words = |name: Option<&str>| {
+            let error = NotLoaded {
+                container: "/box".to_owned(),
+                name: name.map(str::to_owned),
+                plugin: "talkers::Talker".to_owned(),
+                package: "talkers".to_owned(),
+                reason: "no such class".to_owned(),
+            };
+            error.to_string()
+        };
+        assert_eq!(
+            words(Some("/see")),
+            "the component container /box does not load /see (talkers::Talker of package talkers): no such class"
+        );
+        assert_eq!(
+            words(None),
+            "the component container /box does not load talkers::Talker of package talkers: no such class"
+        );
+    }
+}
