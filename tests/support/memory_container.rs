@@ -74,7 +74,7 @@ impl MemoryContainer {
                 loaded: Arc::clone(&loaded),
             };
             let service = format!("{name}/_container/{part}");
-            let served = node.serve(&service, ServiceType::of(&*of), Arc::new(handler));
+            let served = node.serve(&service, ServiceType::of(&of), Arc::new(handler));
             serving.push(served.await.expect("served"));
         }
         Self {

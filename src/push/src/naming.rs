@@ -106,11 +106,8 @@ async fn look(
         biased;
         // What it says of itself is told when it is started again, with its parameters.
         _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed, host)),
-        there = timeout(patience, graph.wait_for(all_there)) => match there.map(|there| there.is_ok()) {
-            Ok(true) => {
-                let _ = timeout(MORE_NODES, settled(&mut graph)).await;
-                Ok(names(&seen.borrow(), unnamed, host))
-            }
+        there = timeout(patience, registered(&mut graph, all_there)) => match there {
+            Ok(true) => Ok(names(&seen.borrow(), unnamed, host)),
             Ok(false) => Err(failed(ProbeError::MasterGone.to_string())),
             // Here it cannot reach what it was granted; it can when it is looked at.
             Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed, host)),
@@ -124,9 +121,17 @@ async fn look(
     }
 }
 
-/// Returns when no other nodes have come for a moment.
-async fn settled(graph: &mut watch::Receiver<Arc<Graph>>) {
-    while let Ok(Ok(())) = timeout(QUIET, graph.changed()).await {}
+/// Returns when all are there and no other nodes have come for a moment; false if the graph is not told any more.
+async fn registered(
+    graph: &mut watch::Receiver<Arc<Graph>>,
+    all_there: impl FnMut(&Arc<Graph>) -> bool,
+) -> bool {
+    if graph.wait_for(all_there).await.is_err() {
+        return false;
+    }
+    let settled = async { while let Ok(Ok(())) = timeout(QUIET, graph.changed()).await {} };
+    let _ = timeout(MORE_NODES, settled).await;
+    true
 }
 
 fn never_registered(alone: &Plan, after: Duration) -> Error {
