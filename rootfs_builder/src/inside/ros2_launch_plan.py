@@ -51,7 +51,7 @@ def resolve(path, ask, plan, refused, give_up):
     words = Words()
     # Loggers of launch keep what they are told to themselves.
     launch.logging.get_logger("launch").addHandler(words)
-    recorder = Recorder(launch, launch_ros, plan)
+    recorder = Recorder(launch, launch_ros, plan, ask["params"])
     recorder.take_over()
     signal.signal(signal.SIGALRM, over_time)
     signal.alarm(PATIENCE)
@@ -85,8 +85,8 @@ def resolve(path, ask, plan, refused, give_up):
 class Recorder:
     """Writes down what launch would start."""
 
-    def __init__(self, launch, launch_ros, plan):
-        self.launch, self.launch_ros, self.plan = launch, launch_ros, plan
+    def __init__(self, launch, launch_ros, plan, params):
+        self.launch, self.launch_ros, self.plan, self.params = launch, launch_ros, plan, params
         self.before = dict(os.environ)
         # Names of containers, each with what is loaded into it, in the order of loading.
         self.loads = []
@@ -197,15 +197,26 @@ class Recorder:
         return perform_substitutions(context, normalize_to_list_of_substitutions(substitutions))
 
     def arguments(self, command, name):
-        """A command line without files that are gone when it is run."""
-        words, rest = [], list(command)
+        """A command line without files that are gone when it is run.
+
+        What a file has for a node by its name counts more than any `-p`, so launch writes a file to change that. Here both become `-p`, of
+        which the last one counts.
+        """
+        words, changed_later = [], given_for(name, self.params)
+        rest = list(command)
         while rest:
-            word = rest.pop(0)
-            if word == "--params-file" and rest and rest[0].startswith(OURS):
-                for parameter, value in parameters_in(rest.pop(0), name):
-                    words += ["-p", "%s:=%s" % (parameter, written(value))]
+            word = rest.pop()
+            if rest[-1:] != ["--params-file"]:
+                words.insert(0, word)
+                continue
+            option = rest.pop()
+            ours = word.startswith(OURS)
+            found = parameters_in(word, name) if ours else texts_in(word, name)
+            if ours or not changed_later.isdisjoint(found):
+                words[:0] = [part for key, text in found.items() for part in ("-p", "%s:=%s" % (key, text))]
+                changed_later.update(found)
             else:
-                words.append(word)
+                words[:0] = [option, word]
         return words
 
     def tell_what_is_left(self, service):
@@ -223,8 +234,50 @@ def process_environment(environment, before):
 # Parameters
 
 
+def given_for(node, params):
+    """Names of the parameters that the deployer gives this node."""
+    if node is None:
+        return set()
+    below = node.rstrip("/") + "/"
+    names = [key[len(below) :] if key.startswith(below) else key.lstrip("~_/") for key in params]
+    return {name.replace("/", ".") for name in names}
+
+
+def texts_in(path, node):
+    """What a file of the image has for a node whose name is known: the texts as they stand there, so that they are of the same types on a
+    command line."""
+    import yaml
+
+    if node is None:
+        return {}
+    try:
+        with open(path, encoding="utf-8") as file:
+            root = yaml.compose(file, yaml.SafeLoader)
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    found = {}
+    for pattern, values in sections(plain(root), ""):
+        if applies(pattern, node):
+            found.update(flattened(values, ""))
+    return found
+
+
+def plain(node):
+    """A tree of YAML with every value as the text that it is."""
+    if node is None:
+        return {}
+    if node.id == "mapping":
+        return {key.value: plain(value) for key, value in node.value}
+    if node.id == "sequence":
+        return "[%s]" % ", ".join(str(plain(one)) for one in node.value)
+    # What has these is a string, and would be something else between brackets.
+    if node.style or re.search(r"[][{}:#,]", node.value):
+        return json.dumps(node.value)
+    return node.value or "null"
+
+
 def parameters_in(path, node):
-    """Names and values that a file has for a node; of one whose name nobody knows, those for all nodes."""
+    """Names and values, as `-p` has them, that a file of launch has for a node; of one whose name nobody knows, those for all nodes."""
     import yaml
 
     class Loader(yaml.SafeLoader):  # pylint: disable=too-many-ancestors
@@ -238,7 +291,7 @@ def parameters_in(path, node):
     for pattern, values in sections(tree, ""):
         if applies(pattern, node):
             found.update(flattened(values, ""))
-    return found.items()
+    return {name: written(value) for name, value in found.items()}
 
 
 def untagged(loader, _tag, node):

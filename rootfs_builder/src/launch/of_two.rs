@@ -329,3 +329,57 @@ fn sections_of_parameter_files_apply_by_name() {
         "[('/ns/n', {'k': 1}), ('/**', {})]"
     );
 }
+
+/// What a launch file's own parameters become behind a parameters file, in a command line of a node whose name is known.
+fn arguments_behind(file: &str, own: &str, given: &[&str]) -> String {
+    let lab = Lab::new();
+    lab.write("board.yaml", file, 0o644);
+    lab.write("launch_params_1", own, 0o644);
+    let (file, own) = (lab.path("board.yaml"), lab.path("launch_params_1"));
+    let params: BTreeMap<&str, i32> = given.iter().map(|name| (*name, 1)).collect();
+    let program = format!(
+        "import ros2_launch_plan as plan\nplan.OURS = {own:?}\nrecorder = plan.Recorder(None, None, {{}}, {})\n\
+         words = ['/x', '--ros-args', '--params-file', {file:?}, '--params-file', {own:?}, '-r', 'a:=b']\n\
+         print(' '.join(recorder.arguments(words, '/front/board')))",
+        serde_json::to_string(&params).expect("JSON"),
+    );
+    let said = Command::new("/usr/bin/python3")
+        .args(["-c", &program])
+        .env("PYTHONPATH", lab.path("cloudroid"))
+        .output()
+        .expect("run");
+    assert!(said.status.success(), "{said:?}");
+    let words = String::from_utf8(said.stdout).expect("UTF-8");
+    let words = words.trim().replace(&*file.to_string_lossy(), "FILE");
+    words
+        .strip_prefix("/x --ros-args ")
+        .expect("the same")
+        .to_owned()
+}
+
+#[test]
+fn what_a_launch_file_changes_of_a_parameters_file_counts() {
+    let file = "/front/board:\n  ros__parameters:\n    f: 2.0\n    gains: {p: 1e3, words: [1, 'a, b', c]}\n    on: yes\n";
+    let own = |text: &str| format!("/front/board:\n  ros__parameters:\n    {text}\n");
+    // Nothing of the file is changed: it stays, and is read when the node runs.
+    let other = arguments_behind(file, &own("g: 1.0"), &[]);
+    assert_eq!(other, "--params-file FILE -p g:=1.0 -r a:=b");
+    // Numbers are written as there, so that they are of the same types.
+    let all = "-p f:=2.0 -p gains.p:=1e3 -p gains.words:=[1, \"a, b\", c] -p on:=yes";
+    let changed = arguments_behind(file, &own("f: 1.0"), &[]);
+    assert_eq!(changed, format!("{all} -p f:=1.0 -r a:=b"));
+    // So does what the deployer gives.
+    for given in ["f", "~gains/p", "/front/board/on"] {
+        let changed = arguments_behind(file, &own("g: 1.0"), &[given]);
+        assert_eq!(changed, format!("{all} -p g:=1.0 -r a:=b"), "{given}");
+    }
+    // One for others, and none at all.
+    let others = arguments_behind(
+        "/back/board:\n  ros__parameters: {f: 2.0}\n",
+        &own("f: 1.0"),
+        &[],
+    );
+    assert_eq!(others, "--params-file FILE -p f:=1.0 -r a:=b");
+    let none = arguments_behind(": [", &own("f: 1.0"), &[]);
+    assert_eq!(none, "--params-file FILE -p f:=1.0 -r a:=b");
+}

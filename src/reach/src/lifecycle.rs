@@ -31,6 +31,8 @@ pub struct Stage {
     pub state: String,
     /// Why it is not active: it was told to be, and did not become it.
     pub refused: Option<String>,
+    /// It is being told to be: until it is, or somebody else drives it, its robot has nothing of it.
+    pub begins: bool,
 }
 
 /// Nodes that have a lifecycle, by name.
@@ -98,7 +100,9 @@ impl Followed {
         let node = LifecycleNode::of(Arc::clone(&self.bus), &name);
         let linked = self.nodes.running().await;
         if !linked.iter().any(|linked| linked.node.name == name) {
+            self.put(&name, |stage| stage.begins = true);
             self.begin(&node, &name).await;
+            self.put(&name, |stage| stage.begins = false);
         }
         let changes = node.watch().await;
         match node.state().await {
@@ -127,26 +131,31 @@ impl Followed {
                 let why = refused.to_string();
                 let observer = &self.observer;
                 observer.event(api::Level::Error, "lifecycle-refused", &why, None);
-                self.shown.send_modify(|all| {
-                    let stage = Stage {
-                        state: State::Unknown.to_string(),
-                        refused: Some(why),
-                    };
-                    all.insert(name.to_owned(), stage);
-                });
+                self.put(name, |stage| stage.refused = Some(why));
             }
         }
     }
 
     /// What was refused stands until the node is active: somebody else may have it become that.
     fn show(&self, name: &str, state: State) {
+        self.put(name, |stage| {
+            stage.state = state.to_string();
+            if state == State::Active {
+                stage.refused = None;
+            }
+        });
+    }
+
+    /// Changes what is shown of a node, and tells of it if it is another.
+    fn put(&self, name: &str, change: impl FnOnce(&mut Stage)) {
         self.shown.send_if_modified(|all| {
             let before = all.get(name);
-            let refused = before.and_then(|before| before.refused.clone());
-            let now = Stage {
-                state: state.to_string(),
-                refused: refused.filter(|_| state != State::Active),
-            };
+            let mut now = before.cloned().unwrap_or_else(|| Stage {
+                state: State::Unknown.to_string(),
+                refused: None,
+                begins: false,
+            });
+            change(&mut now);
             let news = before != Some(&now);
             if news {
                 all.insert(name.to_owned(), now);

@@ -40,6 +40,9 @@ pub(super) async fn interface_there(
         };
         let mut missing = missing(interface, &graph);
         let mut nodes_missing = missing_nodes(interface, &graph);
+        if let Some(stages) = &lifecycles {
+            missing.extend(beginning(&stages.borrow()));
+        }
         for container in loading {
             missing.push(format!("what is loaded into {container}"));
             nodes_missing.push(format!("the nodes of {container}"));
@@ -84,6 +87,12 @@ pub(super) async fn interface_there(
 fn refused(stages: &mut watch::Receiver<Stages>) -> Option<String> {
     let stages = stages.borrow_and_update();
     stages.values().find_map(|stage| stage.refused.clone())
+}
+
+/// Nodes that are on their way to be active, as something that is missing.
+fn beginning(stages: &Stages) -> impl Iterator<Item = String> {
+    let begin = stages.iter().filter(|(_, stage)| stage.begins);
+    begin.map(|(node, _)| format!("the node {node}, which is not active yet"))
 }
 
 /// Containers that have not loaded all of their nodes; else why one does not load one.
@@ -161,5 +170,23 @@ pub(super) async fn unneeded(inner: &Arc<Inner>, handle: &Arc<Handle>, fresh: bo
             _ = life.changed() => {}
             () = tokio::time::sleep_until(until.unwrap_or(now)), if until.is_some() => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_that_is_not_active_yet_is_missing() {
+        let stage = |begins| reach::lifecycle::Stage {
+            state: "inactive".to_owned(),
+            refused: None,
+            begins,
+        };
+        let stages = [("/arm", stage(true)), ("/eye", stage(false))];
+        let stages = Stages::from(stages.map(|(node, stage)| (node.to_owned(), stage)));
+        let missing: Vec<String> = beginning(&stages).collect();
+        assert_eq!(missing, ["the node /arm, which is not active yet"]);
     }
 }
