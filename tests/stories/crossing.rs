@@ -549,13 +549,7 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
     let image = types.message("sensor_msgs/Image")?;
     for (codec, smaller) in [("auto", true), ("none", false)] {
         let cable = Cable::new(&daemon.address)?;
-        cable.degrade(Badness {
-            rate: 20_000,
-            delay: 5,
-            jitter: 0,
-            loss: 0.0,
-            limit: 10_000,
-        })?;
+        cable.degrade(Badness::SLOW)?;
         let site = Site::new()?;
         let app = site.node("/app")?;
         let server = cable.server.to_string();

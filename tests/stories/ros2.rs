@@ -361,13 +361,7 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
     let daemon = world().with(SEER)?;
     for (codec, smaller) in [("auto", true), ("none", false)] {
         let cable = Cable::new(&daemon.address)?;
-        cable.degrade(Badness {
-            rate: 20_000,
-            delay: 5,
-            jitter: 0,
-            loss: 0.0,
-            limit: 10_000,
-        })?;
+        cable.degrade(Badness::SLOW)?;
         let site = Site::of(RosVersion::Two)?;
         let robot = format!("ros2-pictures-{codec}");
         let settings = format!("local = \"none\"\ncodec = \"{codec}\"");

@@ -38,6 +38,15 @@ pub struct Badness {
 }
 
 impl Badness {
+    /// A link that is slow, and nothing else: 20 Mbit/s.
+    pub const SLOW: Self = Self {
+        rate: 20_000,
+        delay: 5,
+        jitter: 0,
+        loss: 0.0,
+        limit: 10_000,
+    };
+
     /// As netem is told.
     fn netem(self) -> Vec<String> {
         [
