@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{Bus, ServiceHandler, ServiceType, reaches};
@@ -107,7 +107,14 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
         site.runtime.block_on(wait).is_ok()
     };
     while !there() {
-        ensure!(Instant::now() < deadline, "no action came: {}", stub.said());
+        if Instant::now() >= deadline {
+            let node = daemon.deployer().types(&["logs", "patient_py"])?;
+            bail!(
+                "no action came: {}\nthe node said: {}",
+                stub.said(),
+                node.said()
+            );
+        }
         gives();
     }
     let mut results = listens(&site, &app, "/move_base/result")?;

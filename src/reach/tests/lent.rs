@@ -331,6 +331,33 @@ async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
 }
 
 #[tokio::test]
+async fn a_lookup_that_is_not_answered_is_asked_again() {
+    let servant = servant().await;
+    let mut robot = Robot::new(true);
+    robot.links(&servant).await;
+    let call = async {
+        loop {
+            match calls(&servant, "x").await.unwrap() {
+                Err(BusError::NoService(_)) => {}
+                other => return other,
+            }
+        }
+    };
+    let answering = async {
+        assert_eq!(robot.hears().await, lookup());
+        // That answer is lost.
+        assert_eq!(robot.hears().await, lookup());
+        robot.has(Some(1));
+        let id = robot.is_called(1, "x").await;
+        robot.session.answer(id, now(), Ok("y".into()));
+    };
+    let (called, ()) = timeout(LONG, async { tokio::join!(call, answering) })
+        .await
+        .unwrap();
+    assert_eq!(called.unwrap(), "y");
+}
+
+#[tokio::test]
 async fn a_call_outlives_a_cut_and_ends_with_the_link() {
     let servant = servant().await;
     let mut robot = Robot::new(true);

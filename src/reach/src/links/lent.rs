@@ -33,6 +33,8 @@ const PATIENCE: Duration = Duration::from_millis(1200);
 const NOT_THERE: Duration = Duration::from_millis(200);
 /// "There" holds longer, but who looks after so long makes the robot look again, without waiting for it.
 const CONFIRM: Duration = Duration::from_secs(1);
+/// The robot answers every question, however it may have been lost: one that it has not answered for so long is asked again.
+const ANSWERS: Duration = Duration::from_secs(3);
 /// Names asked for at a time, and remembered.
 const NAMES: usize = 1000;
 
@@ -50,6 +52,7 @@ pub(super) struct RobotServices {
 enum State {
     /// The robot was asked; a lookup may have waited for its answer in vain, and no other shall.
     Asked {
+        since: Instant,
         in_vain: bool,
     },
     NotThere {
@@ -182,7 +185,7 @@ impl NodeLink {
                 Ok(Err(_)) => return None,
                 Err(_) => {
                     let mut names = self.lent.names.lock();
-                    if let Some(State::Asked { in_vain }) = names.get_mut(service) {
+                    if let Some(State::Asked { in_vain, .. }) = names.get_mut(service) {
                         *in_vain = true;
                     }
                     return None;
@@ -204,8 +207,18 @@ impl NodeLink {
             Some(State::NotThere { since }) if since.elapsed() < NOT_THERE => {
                 return Lookup::Known(None);
             }
-            Some(State::Asked { in_vain: true }) => return Lookup::Known(None),
-            Some(State::Asked { in_vain: false }) => return Lookup::Wait,
+            // The next lookup waits for no longer than this one has.
+            Some(State::Asked {
+                since,
+                in_vain: true,
+            }) => {
+                if since.elapsed() > ANSWERS {
+                    *since = Instant::now();
+                    self.report_lookup(service);
+                }
+                return Lookup::Known(None);
+            }
+            Some(State::Asked { in_vain: false, .. }) => return Lookup::Wait,
             Some(State::NotThere { .. }) | None => {}
         }
         if names.len() >= NAMES && !names.contains_key(service) {
@@ -214,7 +227,12 @@ impl NodeLink {
                 return Lookup::Known(None);
             }
         }
-        names.insert(service.to_owned(), State::Asked { in_vain: false });
+        let since = Instant::now();
+        let asked = State::Asked {
+            since,
+            in_vain: false,
+        };
+        names.insert(service.to_owned(), asked);
         self.report_lookup(service);
         Lookup::Wait
     }
