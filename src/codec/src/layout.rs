@@ -27,7 +27,7 @@ pub enum Schema {
     Other,
 }
 
-/// By name; the md5 of ROS 1, and the hash (REP-2016) of ROS 2, the same from Iron to Jazzy.
+/// By name; the md5 of ROS 1, and the hash (REP-2016) of ROS 2 as Jazzy has it.
 const KNOWN: [(&str, [&str; 2], Schema); 4] = [
     (
         "sensor_msgs/Image",
