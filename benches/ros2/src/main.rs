@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+mod awake;
 mod bus;
 mod camera;
 mod client;

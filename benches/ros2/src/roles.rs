@@ -14,7 +14,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use crate::ends::{hears, join, matched, reads, writes};
 use crate::message::{self, REQUEST, RESPONSE, STRING, TEXT};
 use crate::process::Process;
-use crate::{bus, camera, client, crowd, hop, portal};
+use crate::{awake, bus, camera, client, crowd, hop, portal};
 
 const PING: (&str, &str) = ("rt/ping", STRING);
 const PONG: (&str, &str) = ("rt/pong", STRING);
@@ -38,6 +38,7 @@ pub(crate) fn say(line: &Value) {
 /// Plays the role.
 pub(crate) fn play(words: &[&str]) -> Result<()> {
     match words {
+        ["awake"] => return awake::play(),
         ["datagrams"] => return datagrams(),
         ["datagram-trips", count] => return datagram_trips(count.parse()?),
         ["hop"] => return hop::serve(),

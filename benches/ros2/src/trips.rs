@@ -7,6 +7,7 @@ use anyhow::{Result, ensure};
 use bench_report::{Report, Target};
 use serde_json::Value;
 
+use crate::awake::Awake;
 use crate::rivals::Rival;
 use crate::world::{Program, Transport, World, number};
 
@@ -130,6 +131,7 @@ fn race(
     ways: &[Way],
 ) -> Result<Vec<Option<[f64; 2]>>> {
     let rounds = if crate::full() { 15 } else { 5 };
+    let _awake = Awake::all()?;
     let mut best = vec![Some([f64::INFINITY; 2]); ways.len()];
     for round in 1..=rounds {
         eprintln!("{what}: round {round} of {rounds}");
