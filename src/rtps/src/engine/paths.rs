@@ -69,20 +69,19 @@ impl Path {
             self.turns.push_back(item.writer);
             Queue::default()
         });
-        // What is asked for again and waits already is not sent twice.
+        let same = |other: &Item| {
+            other.number == item.number
+                && (other.reader == item.reader || other.reader == EntityId::UNKNOWN)
+        };
+        // What is asked for again and waits already is not sent twice. Nor is what is under way: what a receiver misses of it is what has not
+        // been sent, or has not been read there, and it is asked again with the last part.
         let covers = |waiting: &Item| {
-            waiting.number == item.number
-                && (waiting.reader == item.reader || waiting.reader == EntityId::UNKNOWN)
-                && waiting.next <= item.next
-                && waiting.last >= item.last
+            same(waiting) && waiting.next <= item.next && waiting.last >= item.last
         };
         let again = item.reader != EntityId::UNKNOWN;
+        let under_way = |(current, _): &(Item, Change)| same(current);
         let waits = again
-            && (queue.waiting.iter().any(covers)
-                || queue
-                    .current
-                    .as_ref()
-                    .is_some_and(|(current, _)| covers(current)));
+            && (queue.waiting.iter().any(covers) || queue.current.as_ref().is_some_and(under_way));
         if !waits {
             queue.waiting.push_back(item);
         }

@@ -582,6 +582,44 @@ fn a_sample_on_its_way_is_not_said_to_be_gone() {
     assert_eq!(read.marks(), [1, 2]);
 }
 
+/// How many submessages of a kind a datagram has.
+fn count(datagram: &[u8], kind: fn(&wire::Submessage) -> bool) -> usize {
+    let parsed = wire::parse(&Bytes::copy_from_slice(datagram));
+    let submessages = parsed.received.iter().map(|it| &it.submessage);
+    submessages.filter(|it| kind(it)).count()
+}
+
+#[test]
+fn what_is_under_way_is_not_sent_again_for_a_receiver_that_asks_in_the_middle() {
+    let mut world = World::of(2);
+    let (writer, _) = world.writer(0, keep(5));
+    let (_, _, read) = world.reader(1, keep(5));
+    world.pass(SECOND);
+    let counted = Arc::new(Mutex::new((0, 0)));
+    let counts = Arc::clone(&counted);
+    world.loses = Box::new(move |_, datagram| {
+        let mut counts = counts.lock();
+        counts.0 += count(datagram, |it| matches!(it, wire::Submessage::DataFrag(_)));
+        counts.1 += count(datagram, |it| matches!(it, wire::Submessage::NackFrag(_)));
+        false
+    });
+    // Two fragments of seven are out when the receiver is asked what it has, four when it answers, and six when that comes.
+    world.room = Some(33_000);
+    world.write(writer, 1, 100_000);
+    world.carry();
+    world.now += SECOND;
+    let now = world.now;
+    world.engines[0].tick(now);
+    world.carry();
+    world.engines[1].tick(now + SECOND);
+    world.carry();
+    assert_eq!(*counted.lock(), (6, 1));
+    world.room = None;
+    world.pass(SECOND);
+    assert_eq!(read.marks(), [1]);
+    assert_eq!(counted.lock().0, 7, "each fragment is sent once");
+}
+
 /// Fast DDS 2.14.5 takes a number of the set of a GAP for the one at its base: where that is a sample of which it has fragments, it forgets it
 /// by half, and whoever takes from that reader then tries for ever.
 #[test]
