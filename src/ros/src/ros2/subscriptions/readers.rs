@@ -92,19 +92,22 @@ impl Readers {
     fn look(&mut self, seen: &Seen) {
         let sources = self.sources(seen);
         let mut needed: BTreeMap<(String, Quality), Bytes> = BTreeMap::new();
-        if let Some(type_name) = &self.type_name {
-            let announced = self.topic.announced();
-            let user_data = announced.map(|of| type_hash::user_data(&of.digest));
-            let key = (type_name.clone(), self.topic.key.wish);
-            needed.insert(key, user_data.unwrap_or_default());
-        }
+        let announced = self.topic.announced();
+        let announced = announced.map(|of| type_hash::user_data(&of.digest));
         for writer in seen.writers(&self.name) {
             if let Some(source) = sources.get(&writer.guid) {
                 let key = (source.type_name.clone(), source.quality);
+                let ours = announced.clone().filter(|_| self.type_name.is_some());
                 needed
                     .entry(key)
-                    .or_insert_with(|| writer.user_data.clone());
+                    .or_insert_with(|| ours.unwrap_or_else(|| writer.user_data.clone()));
             }
+        }
+        // What is wished for shows that somebody listens, until there is a writer. One that offers less would be told that it is
+        // incompatible by such a reader, and nodes write a warning of that into their logs.
+        if let (Some(type_name), true) = (&self.type_name, needed.is_empty()) {
+            let key = (type_name.clone(), self.topic.key.wish);
+            needed.insert(key, announced.unwrap_or_default());
         }
         *self.topic.sources.lock() = sources.clone();
         self.topic.release_named();

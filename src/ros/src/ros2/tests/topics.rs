@@ -3,6 +3,7 @@ use rtps::{Config, EndpointQos, Participant, Reader, Sample, Sink, Topic, Writer
 use super::*;
 use crate::bus::{BusError, Durability, Publisher, Qos, Reliability};
 use crate::net::HostSockets;
+use crate::ros2::bus::Ros2Bus;
 use crate::ros2::place::Place;
 use crate::ros2::{entities, names, type_hash};
 
@@ -176,6 +177,39 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     publishers[0].publish(numbered(99));
     assert_eq!(numbers(&mut subscription, 1).await, [99]);
     assert!(subscription.messages.is_empty());
+}
+
+/// A node writes a warning into its log for each reader that asks for more than it offers.
+#[tokio::test]
+async fn whoever_offers_less_than_is_wished_is_not_told_that_it_does() {
+    let (one, two) = (join(61, "/one").await, join(61, "/two").await);
+    let qos = Qos::keep_last(DEPTH);
+    let less = one.advertise("/scan", string(), qos).await.unwrap();
+    until_known(&two, "/scan").await;
+    let mut subscription = two.subscribe("/scan", string(), latching()).await.unwrap();
+    connected(subscription.matched.clone(), 1).await;
+    connected(less.matched(), 1).await;
+    less.publish(numbered(1));
+    assert_eq!(numbers(&mut subscription, 1).await, [1]);
+    assert_eq!(less.matched().borrow().refused, []);
+    // Who offers it later is heard as was wished.
+    let three = join(61, "/three").await;
+    let latched = three
+        .advertise("/scan", string(), latching())
+        .await
+        .unwrap();
+    latched.publish(numbered(2));
+    assert_eq!(numbers(&mut subscription, 1).await, [2]);
+}
+
+/// Waits until somebody else is known to publish on a topic.
+async fn until_known(bus: &Ros2Bus, topic: &str) {
+    let mut graph = bus.graph();
+    let known = graph.wait_for(|graph| graph.topics.contains_key(topic));
+    timeout(LONG, known)
+        .await
+        .expect("in time")
+        .expect("the bus is open");
 }
 
 #[tokio::test]
