@@ -21,7 +21,7 @@ use crate::error::{Error, IoAt};
 use crate::event::Progress;
 use crate::process::{self, Stream};
 use crate::unused;
-use output::{NAMING, apts_words, parse_relations, parse_stanza, parse_uri};
+use output::{NAMING, after_no_lists, apts_words, parse_relations, parse_stanza, parse_uri};
 
 /// Where packages come from: lines of a sources.list for each base that is named. For others they are the host's own apt
 /// sources, where the host is of the same release; else mmdebstrap's default mirror.
@@ -154,6 +154,13 @@ impl Apt {
         update.args(["-q", "--error-on=any", "update"]);
         let mut lines = Vec::new();
         let result = process::run(update, "apt", |_, line| lines.push(line.to_owned())).await;
+        let result = result.map_err(|error| match error {
+            Error::Program { last_lines, .. } => Error::Lists {
+                next: after_no_lists(&last_lines),
+                words: apts_words(&last_lines),
+            },
+            error => error,
+        });
         for line in lines {
             progress.log(&line).await;
         }
@@ -162,9 +169,7 @@ impl Apt {
                 fs::write(stamp, "").at("writing", stamp)?;
                 Ok(None)
             }
-            Err(error) if age.is_some() => Ok(Some(format!(
-                "package lists could not be fetched, using those at hand: {error}"
-            ))),
+            Err(error) if age.is_some() => Ok(Some(format!("lists at hand are used: {error}"))),
             Err(error) => Err(error),
         }
     }
@@ -471,5 +476,7 @@ Acquire::IndexTargets::deb::Contents-deb-legacy {
 Acquire::IndexTargets::deb::Contents-deb-legacy::DefaultEnabled "true";
 "#;
 
+#[cfg(test)]
+mod signed;
 #[cfg(test)]
 mod tests;

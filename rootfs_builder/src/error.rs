@@ -56,6 +56,14 @@ pub enum Error {
         /// apt's own words.
         words: String,
     },
+    /// Lists of packages that could not be had, or are not believed.
+    #[error("package lists could not be fetched: {words}; {next}")]
+    Lists {
+        /// apt's own words.
+        words: String,
+        /// What to do.
+        next: &'static str,
+    },
     /// Packages that the mirror would not give.
     #[error(
         "packages could not be downloaded: {words}; push again: the package lists will be fetched anew first"

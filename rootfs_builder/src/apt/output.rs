@@ -61,7 +61,7 @@ pub(super) fn parse_stanza(stanza: &str) -> Option<Deb> {
     })
 }
 
-/// The part of apt's refusal that says why: its errors, and the table of what does not fit together.
+/// The part of apt's refusal that says why: its errors, what is wrong with a signature, and the table of what does not fit together.
 pub(super) fn apts_words(lines: &str) -> String {
     let mut table = false;
     let mut words = Vec::new();
@@ -71,7 +71,7 @@ pub(super) fn apts_words(lines: &str) -> String {
         } else if !line.starts_with(' ') {
             table = false;
         }
-        if table || line.starts_with("E:") {
+        if table || line.starts_with("E:") || line.contains("GPG error") {
             words.push(line.trim());
         }
     }
@@ -80,4 +80,28 @@ pub(super) fn apts_words(lines: &str) -> String {
     } else {
         words.join("; ")
     }
+}
+
+/// What to do where apt could not fetch lists, or does not believe them.
+pub(super) fn after_no_lists(words: &str) -> &'static str {
+    let reasons = [
+        (
+            "NO_PUBKEY",
+            "the archive is signed by a key that is not known here: if that key is the right one, save its key ring as a file and name it by \
+             [signed-by=FILE] under [archives] in the configuration",
+        ),
+        (
+            "is not signed",
+            "packages that nobody has signed are not installed: take a mirror that has the distribution's InRelease",
+        ),
+        (
+            "Hash Sum mismatch",
+            "the lists are not those that were signed: the mirror is being updated, or somebody has changed them; push again later, or take another mirror",
+        ),
+    ];
+    let known = reasons.iter().find(|(part, _)| words.contains(part));
+    known.map_or(
+        "push again once this host reaches the archive",
+        |(_, next)| next,
+    )
 }

@@ -191,7 +191,7 @@ fn the_state_directory_is_its_own() {
     assert!(conf.contains("sources.list"), "{conf}");
 }
 
-fn progress() -> Progress {
+pub(super) fn progress() -> Progress {
     // Nobody listens.
     Progress::new(tokio::sync::mpsc::channel(1).0)
 }
