@@ -183,16 +183,8 @@ impl Fanout {
         // A publisher that is gone has taken its message with it.
         if let Some(shared) = self.shared.upgrade() {
             let graph = shared.bus.graph().borrow().clone();
-            let publishers = graph
-                .topics
-                .get(&self.topic)
-                .map(|nodes| nodes.publishers.as_slice())
-                .unwrap_or_default();
             state.latched.retain(|sample| {
-                sample.local
-                    || publishers
-                        .iter()
-                        .any(|name| name == sample.publisher.node())
+                sample.local || graph.publishes(sample.publisher.node(), &self.topic)
             });
         }
         for sample in &state.latched {

@@ -1,4 +1,5 @@
-//! When a servant can be used: when what its interface promises is registered.
+//! When a servant can be used: when what its interface promises is registered. What only a deployer's supplement promises, of
+//! which no node is known, is not awaited: the push did not see it, and it may come with a robot, or never.
 
 use std::collections::BTreeSet;
 
@@ -8,19 +9,15 @@ use ros::bus::Graph;
 /// What of `interface` is not in `graph`, in words.
 pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
     let mut missing = Vec::new();
-    for topic in interface
-        .topics
-        .iter()
-        .filter(|topic| !topic.lazy && !topic.nodes.is_empty())
-    {
-        let ends = graph.topics.get(&topic.name);
+    for topic in interface.topics.iter().filter(|topic| !topic.lazy) {
+        let mut nodes = topic.nodes.iter();
         let (there, what) = match topic.direction {
             Direction::Output => (
-                ends.is_some_and(|ends| covers(&ends.publishers, &topic.nodes)),
+                nodes.all(|node| graph.publishes(node, &topic.name)),
                 "publisher",
             ),
             Direction::Input => (
-                ends.is_some_and(|ends| covers(&ends.subscribers, &topic.nodes)),
+                nodes.all(|node| graph.subscribes(node, &topic.name)),
                 "subscriber",
             ),
         };
@@ -28,15 +25,14 @@ pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
             missing.push(format!("the {what} of {}", topic.name));
         }
     }
-    let late = |name: &String| interface.late.contains(name);
+    let awaited = |name: &String, node: &str| !node.is_empty() && !interface.late.contains(name);
     for service in &interface.services {
-        if !late(&service.name) && !graph.services.contains_key(&service.name) {
+        if awaited(&service.name, &service.node) && !graph.serves(&service.name) {
             missing.push(format!("the service {}", service.name));
         }
     }
     for action in &interface.actions {
-        let ends = graph.actions.get(&action.name);
-        if !late(&action.name) && ends.is_none_or(|ends| ends.servers.is_empty()) {
+        if awaited(&action.name, &action.node) && !graph.serves_action(&action.name) {
             missing.push(format!("the action {}", action.name));
         }
     }
@@ -51,19 +47,15 @@ pub fn missing_nodes(interface: &Interface, graph: &Graph) -> Vec<String> {
     let expected: BTreeSet<&String> = topics.chain(services).chain(actions).collect();
     expected
         .into_iter()
-        .filter(|node| !graph.nodes.contains_key(*node))
+        .filter(|node| !node.is_empty() && !graph.has_node(node))
         .cloned()
         .collect()
-}
-
-fn covers(there: &[String], expected: &[String]) -> bool {
-    expected.iter().all(|node| there.contains(node))
 }
 
 #[cfg(test)]
 mod tests {
     use package::interface::{Action, Service, Topic};
-    use ros::bus::{ActionNodes, TopicNodes};
+    use ros::bus::{ActionNodes, NodeEnds, Qos, ServiceType, TopicNodes, WireType};
 
     use super::*;
 
@@ -167,8 +159,56 @@ mod tests {
             nodes: Vec::new(),
             ..topic("/later", Direction::Input, false)
         }];
-        promised.services.clear();
-        promised.actions.clear();
+        promised.services[0].node.clear();
+        promised.actions[0].node.clear();
         assert!(missing(&promised, &Graph::default()).is_empty());
+        assert!(missing_nodes(&promised, &Graph::default()).is_empty());
+    }
+
+    /// Tools of ROS 2 show none of these names.
+    #[test]
+    fn what_is_hidden_is_there_by_its_nodes_ends() {
+        let node = "/_box";
+        let promised = Interface {
+            topics: vec![
+                Topic {
+                    nodes: vec![node.into()],
+                    ..topic("/_box/seen", Direction::Output, false)
+                },
+                Topic {
+                    nodes: vec![node.into()],
+                    ..topic("/_box/told", Direction::Input, false)
+                },
+            ],
+            services: vec![Service {
+                name: "/_box/load_node".into(),
+                node: node.into(),
+                ..interface().services.remove(0)
+            }],
+            actions: vec![Action {
+                name: "/_box/go".into(),
+                node: node.into(),
+                ..interface().actions.remove(0)
+            }],
+            ..Interface::default()
+        };
+        let mut graph = Graph::default();
+        assert_eq!(missing(&promised, &graph).len(), 4);
+        assert_eq!(missing_nodes(&promised, &graph), [node]);
+        let of = || (WireType::any(), Qos::keep_last(1));
+        let service = |name: &str| (name.to_owned(), ServiceType::new("a/srv/B", "*"));
+        let ends = NodeEnds {
+            publishers: [("/_box/seen".to_owned(), of())].into(),
+            subscribers: [("/_box/told".to_owned(), of())].into(),
+            services: [
+                service("/_box/load_node"),
+                service("/_box/go/_action/send_goal"),
+            ]
+            .into(),
+            ..NodeEnds::default()
+        };
+        graph.ends.insert(node.into(), ends);
+        assert!(missing(&promised, &graph).is_empty());
+        assert!(missing_nodes(&promised, &graph).is_empty());
     }
 }

@@ -25,6 +25,43 @@ pub struct Graph {
     pub ends: BTreeMap<String, NodeEnds>,
 }
 
+/// What is there, under whatever name. What tools hide, by a name with a part that begins with `_`, stands in [`Graph::ends`] alone.
+impl Graph {
+    /// Whether there is a node of this name.
+    pub fn has_node(&self, node: &str) -> bool {
+        self.nodes.contains_key(node) || self.ends.contains_key(node)
+    }
+
+    /// Whether this node publishes the topic.
+    pub fn publishes(&self, node: &str, topic: &str) -> bool {
+        let shown = self.topics.get(topic);
+        let ends = self.ends.get(node);
+        shown.is_some_and(|ends| ends.publishers.iter().any(|it| it == node))
+            || ends.is_some_and(|ends| ends.publishers.contains_key(topic))
+    }
+
+    /// Whether this node subscribes to the topic.
+    pub fn subscribes(&self, node: &str, topic: &str) -> bool {
+        let shown = self.topics.get(topic);
+        let ends = self.ends.get(node);
+        shown.is_some_and(|ends| ends.subscribers.iter().any(|it| it == node))
+            || ends.is_some_and(|ends| ends.subscribers.contains_key(topic))
+    }
+
+    /// Whether some node serves the service.
+    pub fn serves(&self, service: &str) -> bool {
+        let mut ends = self.ends.values();
+        self.services.contains_key(service) || ends.any(|ends| ends.services.contains_key(service))
+    }
+
+    /// Whether some node serves the action.
+    pub fn serves_action(&self, action: &str) -> bool {
+        let shown = self.actions.get(action);
+        shown.is_some_and(|ends| !ends.servers.is_empty())
+            || self.serves(&crate::ros2::names::part_of_action(action, "send_goal"))
+    }
+}
+
 /// All that one node has, as its ends tell it: by name, with types that have no definition.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct NodeEnds {

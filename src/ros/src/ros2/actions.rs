@@ -18,7 +18,7 @@ mod server;
 mod tests;
 
 use crate::bus::{BusError, ServiceType, WireType};
-use crate::ros2::interfaces;
+use crate::ros2::{interfaces, names};
 use crate::schema::ActionDef;
 
 pub(super) use client::Client;
@@ -39,7 +39,7 @@ struct Parts {
 
 impl Parts {
     fn of(action: &str, of: &ActionDef) -> Result<Self, BusError> {
-        let name = |part: &str| format!("{action}/_action/{part}");
+        let name = |part: &str| names::part_of_action(action, part);
         let Some(services) = &of.services else {
             return Err(BusError::Protocol {
                 what: format!("action {action}"),

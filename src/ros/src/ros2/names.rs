@@ -67,6 +67,11 @@ pub fn action_part(name: &str) -> Option<(&str, &str)> {
     (!action.is_empty() && !is_hidden(action)).then_some((action, part))
 }
 
+/// The name of a part of an action: `/fib` and `send_goal` make `/fib/_action/send_goal`.
+pub(crate) fn part_of_action(action: &str, part: &str) -> String {
+    format!("{action}{ACTION}{part}")
+}
+
 /// `std_msgs/msg/String` of DDS's name. What is not made by rosidl is called by its name in DDS.
 pub(super) fn type_of(dds: &str) -> String {
     rosidl_type(dds).unwrap_or_else(|| dds.to_owned())
