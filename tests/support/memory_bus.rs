@@ -568,13 +568,17 @@ impl Bus for MemoryBus {
         let number = self.system.change(|state| {
             let number = state.number();
             let known = state.actions.entry(action.to_owned()).or_default();
-            known.type_name.clone_from(&of.name);
+            // What it is, its server says.
+            if known.server.is_none() {
+                known.type_name.clone_from(&of.name);
+            }
             known.clients.insert(number, self.node.clone());
             number
         });
         Ok(Box::new(MemoryClient {
             system: self.system.clone(),
             action: action.to_owned(),
+            type_name: of.name.clone(),
             number,
         }))
     }
@@ -607,6 +611,7 @@ impl Bus for MemoryBus {
 struct MemoryClient {
     system: Arc<MemorySystem>,
     action: String,
+    type_name: String,
     number: u128,
 }
 
@@ -627,7 +632,11 @@ impl ActionClient for MemoryClient {
             action.is_some_and(|action| !action.servers.is_empty())
         };
         match timeout(patience, graph.wait_for(served)).await {
-            Ok(_) => Ok(()),
+            Ok(Ok(graph)) => match graph.other_action(&self.action, &self.type_name) {
+                Some(other) => Err(other),
+                None => Ok(()),
+            },
+            Ok(Err(_)) => Err(BusError::Closed),
             Err(_) => Err(BusError::Timeout {
                 what: format!("action {}", self.action),
                 after: patience,

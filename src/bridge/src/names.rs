@@ -75,14 +75,19 @@ pub(crate) fn is_same_type(one: &str, other: &str) -> bool {
     one == other || plain_type(one) == plain_type(other)
 }
 
-/// The name of a message's type as the servant's ROS writes it: `package/Type` in ROS 1, `package/msg/Type` in ROS 2. What
-/// is no name of a type stays as it is.
-pub(crate) fn spelled(version: RosVersion, name: &str) -> Cow<'_, str> {
+/// That a topic, service or action has another type than a client says, and what to do.
+pub(crate) fn other_type(what: &str, theirs: &str, said: &str) -> String {
+    format!("{what} has type {theirs}, not {said}; use the type that it has")
+}
+
+/// The name of a type as the servant's ROS writes it: `package/Type` in ROS 1, `package/KIND/Type` in ROS 2, where `kind` is `msg`,
+/// `srv` or `action`. What is no name of a type stays as it is.
+pub(crate) fn spelled<'a>(version: RosVersion, name: &'a str, kind: &str) -> Cow<'a, str> {
     match version {
         RosVersion::One => plain_type(name),
         RosVersion::Two => match name.split_once('/') {
             Some((package, rest)) if !rest.contains('/') => {
-                Cow::Owned(format!("{package}/msg/{rest}"))
+                Cow::Owned(format!("{package}/{kind}/{rest}"))
             }
             _ => Cow::Borrowed(name),
         },
@@ -149,7 +154,7 @@ mod tests {
 
     #[test]
     fn types_are_written_as_either_ros_does() {
-        let message = |version, name| spelled(version, name).into_owned();
+        let message = |version, name| spelled(version, name, "msg").into_owned();
         for name in ["std_msgs/msg/String", "std_msgs/String"] {
             assert_eq!(plain_type(name), "std_msgs/String");
             assert_eq!(message(RosVersion::One, name), "std_msgs/String");
@@ -161,6 +166,7 @@ mod tests {
             message(RosVersion::Two, "a/action/B_Goal"),
             "a/action/B_Goal"
         );
+        assert_eq!(spelled(RosVersion::Two, "a/B", "srv"), "a/srv/B");
         assert_eq!(message(RosVersion::Two, "*"), "*");
         assert_eq!(message(RosVersion::Two, ""), "");
     }

@@ -13,6 +13,7 @@ mod lending;
 pub mod lifecycle;
 pub mod names;
 mod node_ends;
+mod other_types;
 mod parameters;
 mod place;
 pub mod process;

@@ -1,5 +1,6 @@
 //! `call_service`: a client calls a service of the servant, or one of rosapi's, which the bridge answers.
 
+use std::borrow::Cow;
 use std::future::Future;
 use std::sync::Arc;
 use std::task::{Context, Waker};
@@ -15,7 +16,7 @@ use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
 use super::decoding::decode_args;
 use super::{Client, Reply, print_format};
 use crate::lacking::explain;
-use crate::names::digest_word;
+use crate::names::{digest_word, is_same_type, other_type, spelled};
 use crate::own::{self, OwnService};
 use crate::sample::Frame;
 
@@ -24,6 +25,8 @@ struct Call {
     service: String,
     /// As the client wrote it: that is what it looks for in the answer.
     written: String,
+    /// The type that the client says.
+    said: Option<String>,
     id: Option<Id<'static>>,
     args: Option<(Format, Bytes)>,
     timeout: Duration,
@@ -62,6 +65,7 @@ impl Client {
         let call = Call {
             service: String::new(),
             written: op.service.clone().into_owned(),
+            said: op.type_name.map(Cow::into_owned),
             id: reply.id.clone(),
             args: op
                 .args
@@ -144,8 +148,20 @@ impl Client {
         if let Ok(def) = &def {
             self.report_surplus(&call.reply(), "call_service", &def.request, call.args());
         }
+        let other = self.other_type(call, &service_type.name);
         let request = match (&def, call.compression, call.args()) {
-            (Ok(def), compression, args) => decode_args(&def.request, args, compression)?,
+            // Its bytes might be read as anything.
+            (_, Compression::CborRaw, _) if other.is_some() => {
+                return Err(other.unwrap_or_default());
+            }
+            (Ok(def), compression, args) => {
+                let request = decode_args(&def.request, args, compression);
+                let request = request.map_err(|problem| other.clone().unwrap_or(problem))?;
+                if let Some(other) = other {
+                    self.warn(&call.reply(), &format!("call_service: {other}"));
+                }
+                request
+            }
             // ROS bytes both ways need no definition.
             (Err(_), Compression::CborRaw, Some(args)) => Bytes::from(
                 args.raw()
@@ -170,6 +186,20 @@ impl Client {
         }
         let response = response.map_err(|error| error.to_string())?;
         self.response_frame(call, def.as_deref().ok(), &response)
+    }
+
+    /// That the client says another type than the service has. As rosbridge_suite does, a call whose arguments fit is made.
+    fn other_type(&self, call: &Call, theirs: &str) -> Option<String> {
+        let said = call
+            .said
+            .as_deref()
+            .filter(|said| !is_same_type(said, theirs))?;
+        let service = format!("service {}", call.service);
+        Some(other_type(
+            &service,
+            theirs,
+            &spelled(self.version(), said, "srv"),
+        ))
     }
 
     /// Waits for the registration of a service that this client has advertised and calls itself.

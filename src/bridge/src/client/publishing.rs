@@ -11,7 +11,7 @@ use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Una
 use super::decoding::decode;
 use super::{Client, Reply, take_chosen};
 use crate::lacking::explain;
-use crate::names::{digest_word, is_same_type, sought, spelled};
+use crate::names::{digest_word, is_same_type, other_type, sought, spelled};
 use crate::quality::{Offer, offered};
 use crate::tf;
 use crate::topic_publisher::{Notified, TopicPublisher};
@@ -165,8 +165,8 @@ impl Client {
         let other =
             |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
         if let Some(theirs) = theirs.filter(other) {
-            let name = spelled(version, type_name);
-            return Err(format!("topic {topic} has type {theirs}, not {name}"));
+            let name = spelled(version, type_name, "msg");
+            return Err(other_type(&format!("topic {topic}"), theirs, &name));
         }
         self.shared
             .registry

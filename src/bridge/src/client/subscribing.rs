@@ -12,7 +12,7 @@ use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
 use super::{Client, Reply};
 use crate::fanout::{Listener, Listening};
 use crate::lacking::explain;
-use crate::names::{is_same_type, sought, spelled};
+use crate::names::{is_same_type, other_type, sought, spelled};
 use crate::outbox::{Outbox, TopicKey};
 use crate::quality::{asked, most, queue_length};
 use crate::sample::Sample;
@@ -111,7 +111,7 @@ impl Client {
             .type_name
             .as_deref()
             .filter(|name| *name != "*")
-            .map(|name| spelled(self.version(), name).into_owned());
+            .map(|name| spelled(self.version(), name, "msg").into_owned());
         let limit = self.shared.options.max_subscriptions;
         let mut subscribed = self.subscriptions.lock();
         let all: usize = subscribed
@@ -195,8 +195,8 @@ impl Client {
                 ));
             }
             (Some(wanted), Some(actual)) if !is_same_type(wanted, actual) => {
-                let wanted = spelled(version, wanted);
-                return Err(format!("topic {topic} has type {actual}, not {wanted}"));
+                let wanted = spelled(version, wanted, "msg");
+                return Err(other_type(&format!("topic {topic}"), actual, &wanted));
             }
             _ => {}
         }

@@ -203,6 +203,46 @@ async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
 }
 
 #[tokio::test]
+async fn a_goal_of_another_type_is_answered_at_once_with_both() {
+    let world = World::new().await;
+    let dig = |id: &str| json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Dig", "args": {"to": 3}});
+    let expected = format!(
+        "action /count has type {}, not {}; use the type that it has",
+        world.full_name(COUNT, "action"),
+        world.full_name("x_msgs/Dig", "action")
+    );
+    for (mut server, mut user) in pairs(&world).await {
+        // One waits for a server, and one comes when it is there.
+        user.send(dig("early")).await;
+        user.settled().await;
+        serve(&mut server).await;
+        for id in ["early", "late"] {
+            if id == "late" {
+                user.send(dig(id)).await;
+            }
+            let answer = user.json().await;
+            assert_eq!(
+                (&answer["id"], &answer["values"], &answer["result"]),
+                (&json!(id), &json!(expected), &json!(false))
+            );
+        }
+        // And the right one gets through all the same.
+        user.send(goal("right", json!({"to": 3}))).await;
+        assert_eq!(server.json().await["args"], json!({"to": 3}));
+        server
+            .send(json!({"op": "unadvertise_action", "action": "/count"}))
+            .await;
+        assert_eq!(user.json().await["id"], "right");
+        world
+            .in_graph(|graph| {
+                let action = graph.actions.get("/count");
+                action.is_none_or(|action| action.servers.is_empty())
+            })
+            .await;
+    }
+}
+
+#[tokio::test]
 async fn a_goal_that_is_cancelled_before_its_server_is_there_is_never_sent() {
     let world = World::new().await;
     let other = world.another_bridge().await;

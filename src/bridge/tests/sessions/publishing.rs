@@ -237,7 +237,7 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
     assert_eq!(
         client.refusal().await,
         format!(
-            "advertise: topic /text has type {}, not {}",
+            "advertise: topic /text has type {}, not {}; use the type that it has",
             world.spelled("std_msgs/String"),
             world.spelled("std_msgs/Int32")
         )

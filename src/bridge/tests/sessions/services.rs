@@ -7,7 +7,7 @@ use bridge::{BridgeOptions, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{Digest, RosVersion, ServiceHandler, ServiceType};
 use rosbridge::{CallService, Compression, Format, Frame, Op, Payload};
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::sync::Notify;
 
 use super::support::{PATIENCE, World, patient, patiently};
@@ -306,6 +306,42 @@ async fn a_service_of_another_definition_is_not_called() {
         )
     );
     client.settled().await;
+}
+
+#[tokio::test]
+async fn a_call_that_says_another_type_is_answered_with_both_where_it_does_not_fit() {
+    let world = World::new().await;
+    let _served = serves(&world, "/add", None).await;
+    let mut client = world.client().await;
+    let other = format!(
+        "service /add has type {}, not {}; use the type that it has",
+        world.full_name("x_msgs/Add", "srv"),
+        world.full_name("x_msgs/Say", "srv")
+    );
+    let call = |args: Value| json!({"op": "call_service", "id": "c", "service": "/add", "type": "x_msgs/Say", "args": args});
+    client.send(call(json!({"words": "hello"}))).await;
+    let answer = client.json().await;
+    assert_eq!(
+        (&answer["values"], &answer["result"]),
+        (&json!(other), &json!(false))
+    );
+    let mut raw = call(json!({"bytes": ""}));
+    raw["compression"] = "cbor-raw".into();
+    client.send(raw).await;
+    let answer = client.binary().await;
+    let answer = String::from_utf8_lossy(&answer);
+    assert!(answer.contains(&other), "{answer}");
+    // As with rosbridge_suite, which does not look at what the client says.
+    client
+        .send(json!({"op": "set_level", "level": "warning"}))
+        .await;
+    client.send(call(json!({"a": 1, "b": 2}))).await;
+    let told = client.json().await;
+    assert_eq!(
+        (&told["level"], &told["msg"]),
+        (&json!("warning"), &json!(format!("call_service: {other}")))
+    );
+    assert_eq!(client.json().await["values"], json!({"sum": 3}));
 }
 
 #[tokio::test]

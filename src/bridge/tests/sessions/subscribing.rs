@@ -228,7 +228,7 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
     assert_eq!(
         client.refusal().await,
         format!(
-            "subscribe: topic /text has type {}, not {}",
+            "subscribe: topic /text has type {}, not {}; use the type that it has",
             world.spelled("std_msgs/String"),
             world.spelled("std_msgs/Int32")
         )

@@ -42,6 +42,7 @@ const DEFINITIONS: &[(&str, &str)] = &[
         "x_msgs/action/Count",
         "int32 to\n---\nint32[] all\n---\nint32 at\n",
     ),
+    ("x_msgs/action/Dig", "int32 to\n---\n---\n"),
 ];
 
 /// Options with which nothing is given up because the machine is busy.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::BusError;
+use super::{BusError, Graph};
 
 /// How a goal ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,7 +45,8 @@ pub trait GoalEvents: Send + Sync + 'static {
 /// An action that this side sends goals to; dropping it cancels those under way.
 #[async_trait]
 pub trait ActionClient: Send + Sync {
-    /// Returns once a server takes goals and what it answers will be heard.
+    /// Returns once a server takes goals and what it answers will be heard; with [`BusError::TypeMismatch`] at once where the
+    /// servers that there are have another type.
     async fn ready(&self, patience: Duration) -> Result<(), BusError>;
     /// Sends a serialized goal. No other goal of this bus may have the same id.
     fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>);
@@ -69,4 +70,17 @@ pub trait ActionServer: Send + Sync {
     fn feedback(&self, id: &str, feedback: Bytes) -> bool;
     /// Ends a goal; false where there is none of this id under way.
     fn end(&self, id: &str, end: GoalEnd) -> bool;
+}
+
+impl Graph {
+    /// That the servers of an action have another type than this one, where the graph says so.
+    pub fn other_action(&self, action: &str, ours: &str) -> Option<BusError> {
+        let nodes = self.actions.get(action)?;
+        let is_other = !matches!(nodes.type_name.as_str(), "" | "*") && nodes.type_name != ours;
+        (is_other && !nodes.servers.is_empty()).then(|| BusError::TypeMismatch {
+            what: format!("action {action}"),
+            theirs: nodes.type_name.clone(),
+            ours: ours.to_owned(),
+        })
+    }
 }

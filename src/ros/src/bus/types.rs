@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use crate::bus::RosVersion;
+use crate::bus::{BusError, RosVersion};
 use crate::schema::{MessageType, SchemaError, ServiceDef};
 
 /// How messages are written between the ends of a topic or service.
@@ -239,6 +239,30 @@ impl ServiceType {
             && self.request.agrees(&other.request)
             && self.response.agrees(&other.response)
     }
+
+    /// Whether it is the other one, as far as is known.
+    pub fn is(&self, other: &ServiceType) -> bool {
+        self.name == other.name && self.agrees(other)
+    }
+
+    /// That `what` is this there, and not what it is here: by what they differ in, their names or else their digests.
+    pub fn not(&self, ours: &ServiceType, what: String) -> BusError {
+        let pairs = [
+            (&self.digest, &ours.digest),
+            (&self.request, &ours.request),
+            (&self.response, &ours.response),
+        ];
+        let differ = |(theirs, ours): &(&Digest, &Digest)| !theirs.agrees(ours);
+        let digests = pairs.into_iter().find(differ);
+        let (theirs, ours) = match digests.filter(|_| self.name == ours.name) {
+            Some((theirs, of_ours)) => (
+                format!("{} {theirs}", self.name),
+                format!("{} {of_ours}", ours.name),
+            ),
+            None => (self.name.clone(), ours.name.clone()),
+        };
+        BusError::TypeMismatch { what, theirs, ours }
+    }
 }
 
 #[cfg(test)]
@@ -272,5 +296,25 @@ mod tests {
         assert!(known("x").agrees(&known("x")) && known("x").agrees(&known("*")));
         assert!(!known("x").agrees(&known("y")));
         assert!(!ServiceType::new("a/B", "x").agrees(&ServiceType::new("a/B", "y")));
+    }
+
+    #[test]
+    fn types_are_told_by_what_they_differ_in() {
+        let of = |name: &str, request: &str| ServiceType {
+            request: Digest::from(request),
+            ..ServiceType::new(name, "*")
+        };
+        let told = |theirs: ServiceType, ours: ServiceType| {
+            assert!(!theirs.is(&ours));
+            theirs.not(&ours, "service /x".to_owned()).to_string()
+        };
+        assert_eq!(
+            told(of("a/srv/B", "x"), of("c/srv/D", "y")),
+            "service /x is a/srv/B there and c/srv/D here"
+        );
+        assert_eq!(
+            told(of("a/srv/B", "x"), of("a/srv/B", "y")),
+            "service /x is a/srv/B x there and a/srv/B y here"
+        );
     }
 }

@@ -36,9 +36,11 @@ pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<Strin
             continue;
         }
         let answers = |node: &&String| result.publishers.contains(*node);
-        let type_name = goal.type_name.strip_suffix("ActionGoal");
+        // Its servers publish results: a client that publishes goals may be mistaken.
+        let told = result.type_name.strip_suffix("ActionResult");
+        let asked = goal.type_name.strip_suffix("ActionGoal");
         let nodes = ActionNodes {
-            type_name: type_name.unwrap_or("*").to_owned(),
+            type_name: told.or(asked).unwrap_or("*").to_owned(),
             servers: goal.subscribers.iter().filter(answers).cloned().collect(),
             clients: goal.publishers.clone(),
             topics: parts.into(),
@@ -61,8 +63,12 @@ mod tests {
                 ends.reverse();
             }
             let [publishers, subscribers] = ends;
+            let type_name = match name.ends_with("result") {
+                true => "x/DoActionResult",
+                false => "x/OtherActionGoal",
+            };
             let nodes = TopicNodes {
-                type_name: "x/DoActionGoal".to_owned(),
+                type_name: type_name.to_owned(),
                 publishers,
                 subscribers,
             };

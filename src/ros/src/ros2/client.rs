@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
-use rtps::{Ends, Guid, GuidPrefix, SampleIdentity, SequenceNumber, VendorId};
+use rtps::{EndpointData, Ends, Guid, GuidPrefix, SampleIdentity, SequenceNumber, Topic, VendorId};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
@@ -15,8 +15,9 @@ use super::bus::Inner;
 use super::ends::{ReaderEnd, WriterEnd};
 use super::replies::{Key, MAX_IN_FLIGHT, OwnEnds, Replies, Waiting};
 use super::request_header::RequestHeader;
-use super::{names, services, type_hash};
-use crate::bus::{BusError, CallFate, Digest, ServiceType};
+use super::seen::Seen;
+use super::{names, node_ends, services, type_hash};
+use crate::bus::{BusError, CallFate, ServiceType};
 
 /// A server whose ends are known may not say that it knows ours; then a call waits only so long.
 const UNSURE: Duration = Duration::from_millis(200);
@@ -34,13 +35,18 @@ pub(super) struct Servers {
     /// This bus serves it itself.
     here: bool,
     /// The type of a server that has another than this client.
-    other: Option<String>,
+    other: Option<ServiceType>,
 }
 
 impl Servers {
     /// How many there are.
     pub(super) fn count(&self) -> usize {
         self.remote.len() + usize::from(self.here)
+    }
+
+    /// The type of a server that has another than this client, where there are no others.
+    fn only_other(&self) -> Option<&ServiceType> {
+        self.other.as_ref().filter(|_| self.count() == 0)
     }
 }
 
@@ -89,7 +95,8 @@ impl Client {
         let following = Following {
             bus: Arc::clone(bus),
             service: service.to_owned(),
-            request: of.request.clone(),
+            of: of.clone(),
+            request,
             requests: writer.ends(),
             replies: reader.ends(),
             shown,
@@ -111,6 +118,11 @@ impl Client {
     /// The servers to which a call would go, now and later.
     pub(super) fn servers(&self) -> watch::Receiver<Servers> {
         self.servers.clone()
+    }
+
+    /// The type of its server, where that is another than this client's.
+    pub(super) fn other_type(&self) -> Option<ServiceType> {
+        self.servers.borrow().only_other().cloned()
     }
 
     /// Returns once a call would reach a server and be answered.
@@ -145,18 +157,9 @@ impl Client {
         let mut servers = self.servers.clone();
         let is_there = |servers: &Servers| servers.count() > 0 || servers.other.is_some();
         let there = servers.wait_for(is_there).await;
-        let there = there
-            .map(|servers| servers.clone())
-            .map_err(|_| BusError::Closed)?;
-        if let Some(theirs) = there
-            .other
-            .filter(|_| there.remote.is_empty() && !there.here)
-        {
-            return Err(BusError::TypeMismatch {
-                what: format!("service {}", self.service),
-                theirs,
-                ours: format!("{} {}", self.of.name, self.of.request),
-            });
+        let other = there.map(|servers| servers.only_other().cloned());
+        if let Some(theirs) = other.map_err(|_| BusError::Closed)? {
+            return Err(theirs.not(&self.of, format!("service {}", self.service)));
         }
         let is_sure = servers.wait_for(|servers| servers.sure || servers.here);
         let _ = timeout(UNSURE, is_sure).await;
@@ -218,7 +221,9 @@ impl Client {
 struct Following {
     bus: Arc<Inner>,
     service: String,
-    request: Digest,
+    of: ServiceType,
+    /// As DDS has it.
+    request: Topic,
     requests: watch::Receiver<Arc<Ends>>,
     replies: watch::Receiver<Arc<Ends>>,
     shown: watch::Sender<Servers>,
@@ -227,9 +232,11 @@ struct Following {
 impl Following {
     async fn run(mut self) {
         let mut served = self.bus.served.subscribe();
+        let mut seen = self.bus.seen.subscribe();
         loop {
             served.mark_unchanged();
-            let now = self.look();
+            let all = Arc::clone(&seen.borrow_and_update());
+            let now = self.look(&all);
             self.shown.send_if_modified(|before| {
                 let news = *before != now;
                 *before = now;
@@ -239,6 +246,7 @@ impl Following {
                 changed = self.requests.changed() => changed,
                 changed = self.replies.changed() => changed,
                 changed = served.changed() => changed,
+                changed = seen.changed() => changed,
             };
             if changed.is_err() {
                 return;
@@ -246,14 +254,24 @@ impl Following {
         }
     }
 
-    fn look(&mut self) -> Servers {
+    fn look(&mut self, seen: &Seen) -> Servers {
         let requests = Arc::clone(&self.requests.borrow_and_update());
         let replies = Arc::clone(&self.replies.borrow_and_update());
+        let here = services::here(&self.bus, &self.service);
         let mut servers = Servers {
-            here: services::here(&self.bus, &self.service).is_some(),
             answering: replies.matched.iter().map(|it| it.guid.prefix).collect(),
             ..Servers::default()
         };
+        match here {
+            Some(served) if served.of.is(&self.of) => servers.here = true,
+            Some(served) => servers.other = Some(served.of.clone()),
+            None => {}
+        }
+        // Ends of a type with another name do not meet at all.
+        let strangers = seen.readers(&self.request.name).iter();
+        for end in strangers.filter(|end| end.type_name != self.request.type_name) {
+            servers.other = self.type_of(seen, end).or(servers.other);
+        }
         for end in &requests.matched {
             let prefix = end.guid.prefix;
             let mut answers = replies.matched.iter().filter(|it| it.guid.prefix == prefix);
@@ -261,8 +279,8 @@ impl Following {
                 continue;
             }
             let theirs = type_hash::of_message(&end.user_data);
-            if !theirs.agrees(&self.request) {
-                servers.other = Some(format!("{} {theirs}", names::type_of(&end.type_name)));
+            if !theirs.agrees(&self.of.request) {
+                servers.other = self.type_of(seen, end).or(servers.other);
                 continue;
             }
             let knows = |guid: &Guid| guid.prefix == prefix;
@@ -271,5 +289,9 @@ impl Following {
             servers.remote.push(prefix);
         }
         servers
+    }
+    /// What the server with this end serves.
+    fn type_of(&self, seen: &Seen, end: &EndpointData) -> Option<ServiceType> {
+        node_ends::service_type(seen, end, &self.service, false)
     }
 }

@@ -8,7 +8,7 @@ use super::ends::OwnEnds;
 use super::names::{self, Named};
 use super::node_ends;
 use super::seen::Seen;
-use crate::bus::{ActionNodes, Graph, TopicNodes};
+use crate::bus::{Graph, TopicNodes};
 
 /// One end, whoever has it.
 struct End<'a> {
@@ -116,13 +116,15 @@ impl Building {
         }
     }
 
+    /// What it is, its servers say: a client may be mistaken, and those come first here.
     fn action(&mut self, name: &str, end: &End<'_>) {
         let type_name = names::action_type_of(end.type_name);
-        let action = self.graph.actions.entry(name.to_owned());
-        let action = action.or_insert_with(|| ActionNodes {
-            type_name: type_name.unwrap_or_else(|| "*".to_owned()),
-            ..ActionNodes::default()
-        });
+        let type_name = type_name.unwrap_or_else(|| "*".to_owned());
+        let action = self.graph.actions.entry(name.to_owned()).or_default();
+        let is_first_server = !end.writes && action.servers.is_empty();
+        if is_first_server || action.type_name.is_empty() {
+            action.type_name = type_name;
+        }
         let nodes = match end.writes {
             true => &mut action.clients,
             false => &mut action.servers,
@@ -151,6 +153,7 @@ mod tests {
     use super::super::ends::OwnEnd;
     use super::super::entities::{Entities, GidSize, Node};
     use super::*;
+    use crate::bus::ActionNodes;
 
     /// An end with this number in the participant with this number.
     fn guid(participant: u8, end: u8, writes: bool) -> Guid {
@@ -283,6 +286,24 @@ mod tests {
         let nodes: Vec<&str> = graph.nodes.keys().map(String::as_str).collect();
         assert_eq!(nodes, ["/server", "/us"]);
         assert_eq!(graph.nodes["/us"], us.to_string());
+    }
+
+    #[test]
+    fn an_action_is_what_its_server_says() {
+        let server = guid(1, 1, false);
+        let fib = "rq/fib/_action/send_goalRequest";
+        let other = "test_msgs::action::dds_::NestedMessage_SendGoal_Request_";
+        let seen = seen(
+            &[server],
+            vec![
+                endpoint(guid(2, 1, true), fib, other),
+                endpoint(server, fib, SEND_GOAL),
+                endpoint(guid(2, 2, false), fib, other),
+            ],
+        );
+        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(3, 0, true)));
+        let fib = &graph.actions["/fib"];
+        assert_eq!(fib.type_name, "test_msgs/action/Fibonacci");
     }
 
     #[test]

@@ -11,6 +11,7 @@ use tokio::time::sleep_until;
 
 use super::bus::Inner;
 use super::entities::{self, GidSize, Node};
+use super::other_types::OtherTypes;
 use super::seen::Seen;
 use super::{calls, graph};
 
@@ -28,6 +29,7 @@ pub(super) struct Watcher {
     unnamed: HashMap<Guid, Instant>,
     /// When the next of them will be late.
     late_at: Option<Instant>,
+    other_types: OtherTypes,
 }
 
 impl Watcher {
@@ -39,6 +41,7 @@ impl Watcher {
             told: None,
             unnamed: HashMap::new(),
             late_at: None,
+            other_types: OtherTypes::default(),
         }
     }
 
@@ -85,6 +88,12 @@ impl Watcher {
         let mut now = graph::build(&seen, &own, (bus.node.as_str(), bus.participant.guid()));
         bus.seen.send_replace(Arc::clone(&seen));
         calls::forget_unserved(bus, &seen);
+        let services = bus.services.lock();
+        let served = services
+            .iter()
+            .map(|(name, served)| (name.as_str(), &served.of));
+        self.other_types.look(served, &seen);
+        drop(services);
         bus.graph.send_if_modified(|before| {
             now.generation = before.generation;
             let news = **before != now;

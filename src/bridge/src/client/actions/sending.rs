@@ -15,6 +15,7 @@ use super::UnderWayGoal;
 use super::goals::{ActionClient, Goal};
 use crate::client::decoding::decode_args;
 use crate::client::{Client, Reply};
+use crate::names::other_type;
 use crate::tf;
 
 /// A goal that was read and is to be sent.
@@ -191,6 +192,10 @@ async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
         Err(BusError::Timeout { .. }) => {
             let text = format!("action server {name} did not connect within {patience:?}");
             return goal.fail(&text);
+        }
+        Err(BusError::TypeMismatch { theirs, ours, .. }) => {
+            let action = format!("action {name}");
+            return goal.fail(&other_type(&action, &theirs, &ours));
         }
         Err(error) => return goal.fail(&error.to_string()),
     }

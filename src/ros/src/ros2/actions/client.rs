@@ -154,6 +154,9 @@ impl ActionClient for Client {
                 what: format!("action {}", shared.name),
                 after: patience,
             }),
+            Ok(Err(of_part @ BusError::TypeMismatch { .. })) => {
+                Err(shared.other_type().unwrap_or(of_part))
+            }
             Ok(ready) => ready,
         }
     }
@@ -211,6 +214,30 @@ impl Shared {
         drop(ends.wait_for(|ends| !ends.matched.is_empty()).await);
         let is_sure = ends.wait_for(|ends| !ends.confirmed.is_empty());
         drop(timeout(UNSURE, is_sure).await);
+    }
+
+    /// That its server has another type, by the action's name: that of a part is `Fibonacci_SendGoal`.
+    fn other_type(&self) -> Option<BusError> {
+        let services = self.of.services.as_ref()?;
+        let parts = [
+            (&self.send_goal, &services.send_goal),
+            (&self.get_result, &services.get_result),
+        ];
+        parts.into_iter().find_map(|(part, ours)| {
+            let of_action = |of: ServiceType| {
+                let name = of
+                    .name
+                    .rsplit_once('_')
+                    .map(|(action, _)| action.to_owned());
+                ServiceType {
+                    name: name.unwrap_or_default(),
+                    ..of
+                }
+            };
+            let theirs = of_action(part.other_type()?);
+            let what = format!("action {}", self.name);
+            Some(theirs.not(&of_action(ServiceType::of(ours)), what))
+        })
     }
 
     async fn carry_out(

@@ -37,6 +37,7 @@ pub(in crate::ros1) struct Client {
 struct Shared {
     bus: Arc<Inner>,
     name: String,
+    type_name: String,
     goals: Mutex<HashMap<String, Goal>>,
     ends: OnceLock<Ends>,
     answers: Answers,
@@ -79,6 +80,7 @@ impl Client {
         let shared = Arc::new(Shared {
             bus: bus.clone(),
             name: name.to_owned(),
+            type_name: of.name.clone(),
             goals: Mutex::default(),
             ends: OnceLock::new(),
             answers: Answers::default(),
@@ -129,6 +131,13 @@ impl ActionClient for Client {
             shared.takes_goals().await;
             shared.answers.reach_us(&shared.bus, &shared.name).await;
             Ok(())
+        };
+        let ready = async {
+            tokio::select! {
+                biased;
+                other = shared.has_other_type() => Err(other),
+                ready = ready => ready,
+            }
         };
         match timeout(patience, ready).await {
             Ok(ready) => ready,
@@ -232,6 +241,22 @@ impl Shared {
     fn is_connected(&self) -> bool {
         self.matched()
             .is_some_and(|matched| self.has_server(&matched.borrow(), &self.bus.graph.borrow()))
+    }
+
+    /// Returns when its servers turn out to have another type.
+    async fn has_other_type(&self) -> BusError {
+        let mut graph = self.bus.graph.subscribe();
+        loop {
+            let other = graph
+                .borrow_and_update()
+                .other_action(&self.name, &self.type_name);
+            if let Some(other) = other {
+                return other;
+            }
+            if graph.changed().await.is_err() {
+                return BusError::Closed;
+            }
+        }
     }
 
     /// Returns once all are connected who are registered to take goals, a server among them.
