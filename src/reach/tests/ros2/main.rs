@@ -9,6 +9,7 @@ mod network;
 mod network_pictures;
 mod parameters;
 mod robot;
+mod rosbridge;
 mod servers;
 mod services;
 mod topics;
