@@ -1,48 +1,100 @@
 //! Writes the seeds of the codec targets into `corpus/`: run it when a frame's layout has changed.
 //!
-//!     cargo run -p fuzz --example codec_seeds
+//!     cargo run -p fuzz --features video --example codec_seeds
 
 use codec::{Codec, Encoder, JpegOptions, Schema, VideoOptions};
 use std::fs;
 use std::path::Path;
 
+/// How messages are serialized: by ROS 1, or by ROS 2 (CDR, little endian).
+#[derive(Clone, Copy, PartialEq)]
+enum Format {
+    Ros1,
+    Cdr,
+}
+
 /// A serialized message, field by field.
-#[derive(Default)]
-struct Message(Vec<u8>);
+struct Message {
+    bytes: Vec<u8>,
+    format: Format,
+}
 
 impl Message {
-    fn stamped() -> Self {
-        Self::default().u32(1).u32(2).u32(3).bytes(b"map")
+    /// Begins with a header.
+    fn stamped(format: Format) -> Self {
+        // What names CDR takes the room of `seq`; CDR counts from behind it.
+        let seq = match format {
+            Format::Ros1 => [1, 0, 0, 0],
+            Format::Cdr => [0, 1, 0, 0],
+        };
+        let message = Self {
+            bytes: seq.to_vec(),
+            format,
+        };
+        message.u32(2).u32(3).text("map")
     }
 
     fn raw(mut self, bytes: &[u8]) -> Self {
-        self.0.extend_from_slice(bytes);
+        self.bytes.extend_from_slice(bytes);
+        self
+    }
+
+    fn aligned(mut self, size: usize) -> Self {
+        if self.format == Format::Cdr {
+            let filled = (self.bytes.len() - 4).next_multiple_of(size) + 4;
+            self.bytes.resize(filled, 0);
+        }
         self
     }
 
     fn u32(self, value: u32) -> Self {
-        self.raw(&value.to_le_bytes())
+        self.aligned(4).raw(&value.to_le_bytes())
+    }
+
+    fn f32(self, value: f32) -> Self {
+        self.aligned(4).raw(&value.to_le_bytes())
+    }
+
+    fn doubles(self, values: &[f64]) -> Self {
+        values.iter().fold(self.aligned(8), |message, value| {
+            message.raw(&value.to_le_bytes())
+        })
     }
 
     fn bytes(self, bytes: &[u8]) -> Self {
         self.u32(bytes.len() as u32).raw(bytes)
     }
 
+    fn text(self, text: &str) -> Self {
+        match self.format {
+            Format::Ros1 => self.bytes(text.as_bytes()),
+            Format::Cdr => self.bytes(&[text.as_bytes(), b"\0"].concat()),
+        }
+    }
+
     fn floats(self, values: &[f32]) -> Self {
+        let message = self.u32(values.len() as u32);
         values
             .iter()
-            .fold(self.u32(values.len() as u32), |message, value| {
-                message.raw(&value.to_le_bytes())
-            })
+            .fold(message, |message, &value| message.f32(value))
+    }
+
+    /// The last word is filled up.
+    fn end(self) -> Vec<u8> {
+        self.aligned(4).bytes
     }
 }
 
-fn image(encoding: &str, width: u32, height: u32, step: u32, data: &[u8]) -> Vec<u8> {
-    let message = Message::stamped()
-        .u32(height)
-        .u32(width)
-        .bytes(encoding.as_bytes());
-    message.raw(&[0]).u32(step).bytes(data).0
+fn image(
+    format: Format,
+    encoding: &str,
+    width: u32,
+    height: u32,
+    step: u32,
+    data: &[u8],
+) -> Vec<u8> {
+    let message = Message::stamped(format).u32(height).u32(width);
+    message.text(encoding).raw(&[0]).u32(step).bytes(data).end()
 }
 
 /// A slope with some noise.
@@ -52,7 +104,7 @@ fn samples(count: usize) -> Vec<u8> {
         .collect()
 }
 
-fn images() -> Vec<Vec<u8>> {
+fn images(format: Format) -> Vec<Vec<u8>> {
     let depths: Vec<u8> = (0..40 * 36u16)
         .map(|at| if at % 11 == 0 { 0 } else { 900 + at % 40 * 3 })
         .flat_map(u16::to_le_bytes)
@@ -68,16 +120,24 @@ fn images() -> Vec<Vec<u8>> {
         .flat_map(f32::to_le_bytes)
         .collect();
     vec![
-        image("rgb8", 20, 18, 60, &samples(60 * 18)),
-        image("bgra8", 8, 8, 35, &samples(35 * 8)),
-        image("mono8", 30, 40, 33, &samples(33 * 40)),
-        image("bayer_rggb8", 17, 15, 17, &samples(17 * 15)),
-        image("16UC1", 40, 36, 80, &depths),
-        image("32FC1", 24, 24, 96, &metres),
+        image(format, "rgb8", 20, 18, 60, &samples(60 * 18)),
+        image(format, "bgra8", 8, 8, 35, &samples(35 * 8)),
+        image(format, "mono8", 30, 40, 33, &samples(33 * 40)),
+        image(format, "bayer_rggb8", 17, 15, 17, &samples(17 * 15)),
+        image(format, "16UC1", 40, 36, 80, &depths),
+        image(format, "32FC1", 24, 24, 96, &metres),
     ]
 }
 
-fn grid(shift: u32, extra: usize) -> Vec<u8> {
+/// Cells of half a metre.
+fn map(format: Format, side: u32, origin: f64, cells: &[u8]) -> Vec<u8> {
+    let message = Message::stamped(format).u32(0).u32(0).f32(0.5);
+    let message = message.u32(side).u32(side);
+    let pose = [origin, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+    message.doubles(&pose).bytes(cells).end()
+}
+
+fn grid(format: Format, shift: u32, extra: usize) -> Vec<u8> {
     let cells: Vec<u8> = (0..70 * 70)
         .map(|at| match (at % 70 + extra, at / 70) {
             (x, 30) if x > 20 => 100,
@@ -85,36 +145,25 @@ fn grid(shift: u32, extra: usize) -> Vec<u8> {
             _ => 255,
         })
         .collect();
-    let message = Message::stamped().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
-    let origin = f64::from(shift) * 0.5;
-    let message = message
-        .u32(70)
-        .u32(70)
-        .raw(&origin.to_le_bytes())
-        .raw(&[0; 48]);
-    message.bytes(&cells).0
+    map(format, 70, f64::from(shift) * 0.5, &cells)
 }
 
-fn shaded() -> Vec<u8> {
-    let message = Message::stamped().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
-    let message = message.u32(40).u32(40).raw(&[0; 56]);
-    message.bytes(&samples(1600)).0
+fn shaded(format: Format) -> Vec<u8> {
+    map(format, 40, 0.0, &samples(1600))
 }
 
 /// In the few shades that a mapper leaves.
-fn laddered() -> Vec<u8> {
+fn laddered(format: Format) -> Vec<u8> {
     let cells: Vec<u8> = (0..60 * 60usize)
         .map(|at| match (at % 60, at / 60) {
             (x, y) if x < 20 || y < 10 => 255,
             (x, y) => [35, 22, 13, 8, 4, 2, 1, 0][(x + y) / 20 + ((at * 7919) >> 4) % 3],
         })
         .collect();
-    let message = Message::stamped().raw(&[0; 8]).raw(&0.5f32.to_le_bytes());
-    let message = message.u32(60).u32(60).raw(&[0; 56]);
-    message.bytes(&cells).0
+    map(format, 60, 0.0, &cells)
 }
 
-fn scan(rough: bool) -> Vec<u8> {
+fn scan(format: Format, rough: bool) -> Vec<u8> {
     let ranges: Vec<f32> = (0..300)
         .map(|beam| match beam % 23 {
             0 => f32::INFINITY,
@@ -123,15 +172,14 @@ fn scan(rough: bool) -> Vec<u8> {
         })
         .collect();
     let echoes: Vec<f32> = (0..300).map(|beam| (beam % 50) as f32).collect();
-    Message::stamped()
-        .raw(&[0; 28])
-        .floats(&ranges)
-        .floats(&echoes)
-        .0
+    let message = Message::stamped(format);
+    let message = (0..7).fold(message, |message, _| message.f32(0.0));
+    message.floats(&ranges).floats(&echoes).end()
 }
 
 /// Fields of a cloud: name, offset, number.
 fn cloud(
+    format: Format,
     width: u32,
     height: u32,
     step: u32,
@@ -139,22 +187,22 @@ fn cloud(
     padding: u32,
     data: &[u8],
 ) -> Vec<u8> {
-    let message = Message::stamped()
+    let message = Message::stamped(format)
         .u32(height)
         .u32(width)
         .u32(fields.len() as u32);
     let message = fields.iter().fold(message, |message, &(name, at, number)| {
-        message.bytes(name.as_bytes()).u32(at).raw(&[number]).u32(1)
+        message.text(name).u32(at).raw(&[number]).u32(1)
     });
     let message = message
         .raw(&[0])
         .u32(step)
         .u32(step * width + padding)
         .bytes(data);
-    message.raw(&[1]).0
+    message.raw(&[1]).end()
 }
 
-fn clouds() -> Vec<Vec<u8>> {
+fn clouds(format: Format) -> Vec<Vec<u8>> {
     let mut camera = Vec::new();
     let mut laser = Vec::new();
     for v in 0..12 {
@@ -187,6 +235,7 @@ fn clouds() -> Vec<Vec<u8>> {
     let xyz = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)];
     vec![
         cloud(
+            format,
             16,
             12,
             18,
@@ -195,6 +244,7 @@ fn clouds() -> Vec<Vec<u8>> {
             &camera,
         ),
         cloud(
+            format,
             160,
             1,
             27,
@@ -241,6 +291,63 @@ fn write(target: &str, name: &str, bytes: &[u8]) {
     fs::write(folder.join(name), bytes).expect("the corpus can be written");
 }
 
+/// Seeds of all that knows a message's fields.
+fn known(format: Format) {
+    let suffix = match format {
+        Format::Ros1 => "",
+        Format::Cdr => "_cdr",
+    };
+    let grids = [grid(format, 0, 0), grid(format, 0, 3), grid(format, 4, 5)];
+    let rgb: Vec<_> = (0..4)
+        .map(|round| {
+            let data = &samples(96 * 24 + round * 5)[round * 5..];
+            image(format, "rgb8", 32, 24, 96, data)
+        })
+        .collect();
+    let maps = vec![grids[0].clone(), shaded(format), laddered(format)];
+    let kinds = [
+        (Schema::Image, images(format)),
+        (Schema::OccupancyGrid, maps),
+        (
+            Schema::LaserScan,
+            vec![scan(format, false), scan(format, true)],
+        ),
+        (Schema::PointCloud2, clouds(format)),
+    ];
+    let mut mixed = Vec::new();
+    for (number, (schema, messages)) in kinds.iter().enumerate() {
+        let codec = Codec::made_for(*schema);
+        for (index, message) in messages.iter().enumerate() {
+            let frames = frames(*schema, codec, std::slice::from_ref(message));
+            let target = format!("codec_{}", codec.name());
+            write(&target, &format!("kind{index}{suffix}"), &list(&frames, 2));
+            if index == 0 {
+                mixed.extend(frames);
+            }
+            let message = [&[number as u8], &message[..]].concat();
+            let name = format!("{}{index}{suffix}", codec.name());
+            write("codec_message", &name, &message);
+        }
+    }
+    let other = Codec::made_for(Schema::Other);
+    mixed.extend(frames(Schema::Other, other, &[samples(700)]));
+    let made = frames(Schema::OccupancyGrid, Codec::Grid, &grids);
+    let name = format!("successors{suffix}");
+    write("codec_grid", &name, &list(&made, 2));
+    let made = frames(Schema::Image, Codec::Video, &rgb);
+    write("codec_video", &format!("moving{suffix}"), &list(&made, 2));
+    mixed.extend(made);
+    let grey = image(format, "mono8", 33, 25, 40, &samples(40 * 25));
+    let made = [
+        frames(Schema::Image, Codec::Jpeg, &rgb[..1]),
+        frames(Schema::Image, Codec::Jpeg, &[grey]),
+    ];
+    let name = format!("kinds{suffix}");
+    write("codec_jpeg", &name, &list(&made.concat(), 2));
+    mixed.extend(made.concat());
+    write("codec_frame", &format!("all{suffix}"), &list(&mixed, 0));
+}
+
 fn main() {
     let text = samples(700);
     for (target, codec) in [
@@ -251,59 +358,8 @@ fn main() {
         let frames = frames(Schema::Other, codec, &[text.clone(), vec![0; 5000]]);
         write(&format!("codec_{target}"), "two", &list(&frames, 2));
     }
-    let grids = [grid(0, 0), grid(0, 3), grid(4, 5)];
-    let rgb: Vec<_> = (0..4)
-        .map(|round| {
-            image(
-                "rgb8",
-                32,
-                24,
-                96,
-                &samples(96 * 24 + round * 5)[round * 5..],
-            )
-        })
-        .collect();
-    let kinds = [
-        (Schema::Image, images()),
-        (
-            Schema::OccupancyGrid,
-            vec![grids[0].clone(), shaded(), laddered()],
-        ),
-        (Schema::LaserScan, vec![scan(false), scan(true)]),
-        (Schema::PointCloud2, clouds()),
-        (Schema::Other, vec![text]),
-    ];
-    let mut mixed = Vec::new();
-    for (number, (schema, messages)) in kinds.iter().enumerate() {
-        let codec = Codec::made_for(*schema);
-        for (index, message) in messages.iter().enumerate() {
-            let frames = frames(*schema, codec, std::slice::from_ref(message));
-            if *schema != Schema::Other {
-                let target = format!("codec_{}", codec.name());
-                write(&target, &format!("kind{index}"), &list(&frames, 2));
-            }
-            if index == 0 {
-                mixed.extend(frames);
-            }
-            let message = [&[number as u8], &message[..]].concat();
-            write(
-                "codec_message",
-                &format!("{}{index}", codec.name()),
-                &message,
-            );
-        }
-    }
-    let made = frames(Schema::OccupancyGrid, Codec::Grid, &grids);
-    write("codec_grid", "successors", &list(&made, 2));
-    let made = frames(Schema::Image, Codec::Video, &rgb);
-    write("codec_video", "moving", &list(&made, 2));
-    mixed.extend(made);
-    let grey = image("mono8", 33, 25, 40, &samples(40 * 25));
-    let made = [
-        frames(Schema::Image, Codec::Jpeg, &rgb[..1]),
-        frames(Schema::Image, Codec::Jpeg, &[grey]),
-    ];
-    write("codec_jpeg", "kinds", &list(&made.concat(), 2));
-    mixed.extend(made.concat());
-    write("codec_frame", "all", &list(&mixed, 0));
+    // The fifth kind has no fields.
+    write("codec_message", "zstd0", &[&[4], &text[..]].concat());
+    known(Format::Ros1);
+    known(Format::Cdr);
 }
