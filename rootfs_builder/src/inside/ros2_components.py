@@ -181,7 +181,7 @@ def container_name(plugin, taken):
     """For a container of its own."""
     stem = re.sub(r"\W", "_", plugin.rpartition("::")[2]) + "_container"
     name, number = stem, 1
-    while name in taken:
+    while "/" + name in taken:
         number += 1
         name = "%s_%d" % (stem, number)
     return name

@@ -226,7 +226,7 @@ def rules_of(arguments):
 
 
 def from_executables(ask, plan, asked_nodes):
-    taken, started = set(), set()
+    taken = set()
     for words in asked_nodes:
         asked, *arguments = shlex.split(words) or [words]
         found = find_executable(ask["packages"], asked)
@@ -239,18 +239,18 @@ def from_executables(ask, plan, asked_nodes):
         package, wanted, path = found
         arguments, given, namespace = rules_of(arguments)
         stem = given or stem_of(wanted)
+        above = (namespace or "").rstrip("/") + "/"
         name, number = stem, 1
-        while name in taken:
+        while above + name in taken:
             number += 1
             name = "%s_%d" % (stem, number)
-        taken.add(name)
-        # As under `ros2 run` the program names itself; two nodes of one name are told apart by nobody.
-        named = given is not None or path in started
-        started.add(path)
+        taken.add(above + name)
+        # As under `ros2 run` the program names its nodes itself: what they are called is looked at, and told where it is taken.
+        named = given is not None
         if named and name != given:
-            arguments = arguments + ["--ros-args", "-r", "__node:=" + name]
-        name = (namespace or "").rstrip("/") + "/" + name
-        plan["nodes"].append(planned(name, package, wanted, [path] + arguments, named))
+            # Of several rules the first one counts.
+            arguments = ["--ros-args", "-r", "__node:=" + name, "--"] + arguments
+        plan["nodes"].append(planned(above + name, package, wanted, [path] + arguments, named))
 
 
 def planned(name, package, executable, argv, named):
@@ -275,7 +275,7 @@ def contain(plan, package, plugin, arguments, taken):
     if path is None:
         raise Refused("no_container", plugin=plugin)
     name = components.container_name(plugin, taken)
-    taken.add(name)
+    taken.add("/" + name)
     argv = [path, "--ros-args", "-r", "__node:=" + name]
     plan["nodes"].append(planned("/" + name, components.PACKAGE, components.PROGRAM, argv, True))
     plan["components"]["/" + name] = [components.of_command_line(package, plugin, arguments, Refused)]

@@ -111,19 +111,11 @@ fn programs_of_an_installed_package_are_nodes() {
         talker.argv[0],
         lab.path("space/lib/talk/talker").display().to_string()
     );
-    // The program names itself, but for the second of one program.
-    assert_eq!(
-        answer
-            .nodes
-            .iter()
-            .map(|node| node.named)
-            .collect::<Vec<_>>(),
-        [false, true, false]
-    );
+    // The programs name their nodes themselves.
+    assert!(answer.nodes.iter().all(|node| !node.named));
     let remapped = ["--ros-args", "-r", "in:=out", "--"];
     assert_eq!(argv(&answer, 0), [&["--loud"][..], &remapped].concat());
-    let named = ["--ros-args", "-r", "__node:=talker_2"];
-    assert_eq!(argv(&answer, 1), [&named[..], &remapped].concat());
+    assert_eq!(argv(&answer, 1), remapped);
     assert_eq!(answer.nodes[2].package, "turtle");
     let keys: Vec<&str> = answer.parameters.keys().map(String::as_str).collect();
     assert_eq!(
@@ -203,6 +195,25 @@ fn nodes_are_named_as_on_either_command_line() {
     assert_eq!(argv(&answer, 1), words);
     let words = ["--ros-args", "-r", "__node:=three", "-p", "rate:=1"];
     assert_eq!(argv(&answer, 2), words);
+    // A name that is taken gets a number, before the rule that asks for it; in another namespace it is another one.
+    let asked = [
+        "talker __node:=one",
+        "talker __node:=one",
+        "talker __node:=one __ns:=/below",
+    ];
+    let answer = lab.ask(&lab.of("space", &asked)).expect("a plan");
+    let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
+    assert_eq!(names, ["/one", "/one_2", "/below/one"]);
+    let rules = [
+        "--ros-args",
+        "-r",
+        "__node:=one_2",
+        "--",
+        "--ros-args",
+        "-r",
+        "__node:=one",
+    ];
+    assert_eq!(argv(&answer, 1), rules);
 }
 
 #[test]

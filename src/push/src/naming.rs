@@ -27,8 +27,8 @@ use super::probe::{self, Alive, NODE};
 use crate::Error;
 use store::Plan;
 
-/// A program may be several nodes (ROS 2), which come one after the other: its first by name is the one that it is called by. For so long others are
-/// waited for after one, and after the first.
+/// A program may be several nodes (ROS 2), which come one after the other: its first by name is the one that it is called by. What is taken already
+/// gets a number, as every node of a second such program does. For so long others are waited for after one, and after the first.
 const QUIET: Duration = Duration::from_millis(200);
 const MORE_NODES: Duration = Duration::from_secs(2);
 
@@ -78,6 +78,9 @@ pub(super) async fn settle(
     Ok(())
 }
 
+/// Names of a program's nodes, the first by name first.
+type Names = BTreeMap<usize, Vec<String>>;
+
 /// Names by index, as far as they could be found; those of nodes that end at once stay unknown.
 async fn look(
     pusher: &Pusher,
@@ -85,7 +88,7 @@ async fn look(
     ros: RosVersion,
     alone: &Plan,
     unnamed: &[usize],
-) -> Result<Vec<(usize, String)>, Error> {
+) -> Result<Names, Error> {
     let failed = |message: String| Error::Failed {
         message,
         next: None,
@@ -148,27 +151,29 @@ fn never_registered(alone: &Plan, after: Duration) -> Error {
     }
 }
 
-/// Which node of the graph is which: its name without namespace, or an absolute one where its program has chosen the namespace itself. `host`: the name
-/// of the machine that they think they run on.
-fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Vec<(usize, String)> {
-    let mut names = Vec::new();
+/// Which nodes of the graph are whose: their names without namespace, or an absolute one where its program has chosen the namespace itself. `host`: the
+/// name of the machine that they think they run on.
+fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Names {
+    let mut names = Names::new();
     for index in unnamed {
         let below = format!("{}/", namespace(*index));
         let own = graph.nodes.keys();
-        let own = own
+        let mut said: Vec<&str> = own
             .filter_map(|node| node.strip_prefix(below.as_str()))
-            .min();
+            .collect();
         // A program may choose its namespace itself; alone it is known all the same.
-        let only = (unnamed.len() == 1)
-            .then(|| graph.nodes.keys().find(|node| *node != NODE))
-            .flatten();
-        let said = own.or(only.map(String::as_str));
+        if said.is_empty() && unnamed.len() == 1 {
+            let only = graph.nodes.keys().find(|node| *node != NODE);
+            said.extend(only.map(String::as_str));
+        }
         // What a program registers is untrusted.
         let said = said
+            .into_iter()
             .map(|name| without_host(without_random_end(name), host))
             .filter(|name| is_graph_name(&format!("/{}", name.trim_start_matches('/'))));
-        if let Some(name) = said {
-            names.push((*index, name));
+        let said: Vec<String> = said.collect();
+        if !said.is_empty() {
+            names.insert(*index, said);
         }
     }
     names
@@ -212,7 +217,7 @@ fn apply(
     plan: &mut Plan,
     flavour: &Flavour,
     unnamed: &[usize],
-    found: &[(usize, String)],
+    found: &Names,
     options: &PushOptions,
 ) {
     let mut taken: BTreeSet<String> = plan
@@ -224,20 +229,24 @@ fn apply(
         .collect();
     for index in unnamed {
         let guess = plan.nodes[*index].name.clone();
-        let known = found.iter().find(|(of, _)| of == index);
-        let known = known.map(|(_, name)| name.as_str());
         let above = guess.rsplit_once('/').map_or("", |(above, _)| above);
-        let wanted = match known {
-            Some(absolute) if absolute.starts_with('/') => absolute.to_owned(),
-            Some(name) => format!("{above}/{name}"),
-            None => guess.clone(),
-        };
-        let mut name = wanted.clone();
-        let mut number = 1;
-        while !taken.insert(name.clone()) {
-            number += 1;
-            name = format!("{wanted}_{number}");
+        let mut called = Vec::new();
+        for known in found.get(index).into_iter().flatten() {
+            let wanted = match known.starts_with('/') {
+                true => known.clone(),
+                false => format!("{above}/{known}"),
+            };
+            let own = known.rsplit('/').next().unwrap_or(known);
+            called.push((own.to_owned(), free(wanted, &mut taken)));
         }
+        let (name, identity) = match called.first() {
+            Some((_, first)) => (first.clone(), flavour.renamed(&called)),
+            None => {
+                let name = free(guess.clone(), &mut taken);
+                let identity = flavour.identity(&name);
+                (name, identity)
+            }
+        };
         for key in options.params.keys().filter(|key| !key.starts_with('/')) {
             let bare = key.trim_start_matches(['~', '_']);
             if let Some(value) = plan.parameters.remove(&format!("{guess}/{bare}")) {
@@ -245,16 +254,22 @@ fn apply(
             }
         }
         let node = &mut plan.nodes[*index];
-        let own = known.map(|name| name.rsplit('/').next().unwrap_or(name));
-        let identity = match own {
-            Some(own) => flavour.renamed(own, &name),
-            None => flavour.identity(&name),
-        };
         node.name = name;
         tell_parameters(flavour, node, &plan.parameters);
         flavour.put(identity.arguments, &mut node.argv);
         node.environment.extend(identity.environment);
     }
+}
+
+/// Takes a name, with a number where it is taken.
+fn free(wanted: String, taken: &mut BTreeSet<String>) -> String {
+    let mut name = wanted.clone();
+    let mut number = 1;
+    while !taken.insert(name.clone()) {
+        number += 1;
+        name = format!("{wanted}_{number}");
+    }
+    name
 }
 
 /// Tells a node its parameters, where nodes hold their own; not again what it was told before (a node of an exported service).
@@ -370,6 +385,14 @@ mod tests {
         }
     }
 
+    fn found(said: &[(usize, &[&str])]) -> Names {
+        let said = said.iter().map(|(index, names)| {
+            let names = names.iter().map(|&name| name.to_owned());
+            (*index, names.collect())
+        });
+        said.collect()
+    }
+
     #[test]
     fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
         let mut plan = plan(&["/costmap_2d_node", "/other", "/third"]);
@@ -377,7 +400,7 @@ mod tests {
         for key in ["/costmap_2d_node/rate", "/costmap_2d_node/stays"] {
             plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
         }
-        let found = [(0, "costmap_2d".to_owned()), (2, "other".to_owned())];
+        let found = found(&[(0, &["costmap_2d"]), (2, &["other"])]);
         apply(&mut plan, &Flavour::default(), &[0, 2], &found, &options);
         let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
         assert_eq!(names, ["/costmap_2d", "/other", "/other_2"]);
@@ -412,10 +435,14 @@ mod tests {
             let words = ["--ros-args", "-r", &*format!("__ns:={namespace}")];
             node.argv.extend(words.map(str::to_owned));
         }
-        let found = [(0, "talker"), (1, "talker"), (2, "own"), (3, "/chosen/own")];
-        let found = found.map(|(index, name)| (index, name.to_owned()));
+        let said = found(&[
+            (0, &["talker"]),
+            (1, &["talker"]),
+            (2, &["own"]),
+            (3, &["/chosen/own"]),
+        ]);
         let given = PushOptions::default();
-        apply(&mut plan, &flavour, &[0, 1, 2, 3], &found, &given);
+        apply(&mut plan, &flavour, &[0, 1, 2, 3], &said, &given);
         let told = |index: usize| {
             let node: &NodeSpec = &plan.nodes[index];
             (node.name.as_str(), node.argv.join(" "))
@@ -425,15 +452,39 @@ mod tests {
         assert_eq!(told(1), ("/back/talker", kept("/back")));
         assert_eq!(told(2), ("/own", "/x".to_owned()));
         assert_eq!(told(3), ("/chosen/own", "/x".to_owned()));
-        // Two of one name: the second one's program may be other nodes, too.
-        let mut twice = self::plan(&["/talker", "/talker"]);
-        let found = [(0, "talker".to_owned()), (1, "talker".to_owned())];
-        apply(&mut twice, &flavour, &[0, 1], &found, &given);
-        assert_eq!(twice.nodes[1].name, "/talker_2");
-        assert_eq!(
-            twice.nodes[1].argv,
-            ["/x", "--ros-args", "-r", "talker:__node:=talker_2"]
-        );
+    }
+
+    #[test]
+    fn each_node_of_a_second_program_of_several_nodes_has_a_name_of_its_own() {
+        let flavour = Flavour {
+            ros: ros::flavour::Version::Ros2,
+            ..Flavour::default()
+        };
+        let mut twice = plan(&["/duet", "/duet_2", "/soloist"]);
+        let key = |name: &str| format!("{name}/rate");
+        for name in ["/duet", "/duet_2", "/soloist"] {
+            twice.parameters.insert(key(name), ParamValue::Int(1));
+        }
+        let said = found(&[
+            (0, &["alto", "tenor"]),
+            (1, &["alto", "tenor"]),
+            (2, &["solo", "tenor"]),
+        ]);
+        apply(&mut twice, &flavour, &[0, 1, 2], &said, &given(&["rate"]));
+        let rate = ["--ros-args", "-p", "rate:=1", "--"];
+        let told = |index: usize| {
+            let argv = &twice.nodes[index].argv;
+            let rules = argv.len() - rate.len();
+            assert_eq!(argv[rules..], rate);
+            (&*twice.nodes[index].name, argv[..rules].join(" "))
+        };
+        assert_eq!(told(0), ("/alto", "/x".to_owned()));
+        let rules = "/x --ros-args -r alto:__node:=alto_2 -r tenor:__node:=tenor_2";
+        assert_eq!(told(1), ("/alto_2", rules.to_owned()));
+        let rules = "/x --ros-args -r tenor:__node:=tenor_3";
+        assert_eq!(told(2), ("/solo", rules.to_owned()));
+        let keys: Vec<&String> = twice.parameters.keys().collect();
+        assert_eq!(keys, ["/alto/rate", "/alto_2/rate", "/solo/rate"]);
     }
 
     #[test]
@@ -472,6 +523,7 @@ mod tests {
         let graph = Graph {
             nodes: [
                 "/cloudroid_name_0/costmap_2d",
+                "/cloudroid_name_0/below/planner",
                 "/cloudroid_name_3/talker_71_1700000000123",
                 "/cloudroid_name_4/x'$(cmd)'",
                 "/cloudroid_name_5/cpu_monitor_push_1_names",
@@ -483,8 +535,11 @@ mod tests {
         };
         assert_eq!(
             names(&graph, &[0, 3, 4, 5], "push-1-names"),
-            [(0, "costmap_2d"), (3, "talker"), (5, "cpu_monitor")]
-                .map(|(index, name)| (index, name.to_owned()))
+            found(&[
+                (0, &["below/planner", "costmap_2d"]),
+                (3, &["talker"]),
+                (5, &["cpu_monitor"]),
+            ])
         );
     }
 

@@ -77,12 +77,15 @@ impl Flavour {
         }
     }
 
-    /// What calls a program's node of the name `own` (without namespace) by this absolute name. Where a program may be several nodes (ROS 2) the others
-    /// keep theirs, and one that is called so already is told nothing.
-    pub fn renamed(&self, own: &str, node: &str) -> Identity {
+    /// What calls a program's nodes by absolute names: what each calls itself (without namespace), and what it is called. In ROS 1 a program is one
+    /// node, the first; in ROS 2 it may be several, and one that is called so already is told nothing.
+    pub fn renamed(&self, nodes: &[(String, String)]) -> Identity {
         match self.ros {
-            Version::Ros1 => ros1::process::identity(node),
-            Version::Ros2 => ros2::process::renamed(own, node),
+            Version::Ros1 => nodes
+                .first()
+                .map(|(_, node)| ros1::process::identity(node))
+                .unwrap_or_default(),
+            Version::Ros2 => ros2::process::renamed(nodes),
         }
     }
 

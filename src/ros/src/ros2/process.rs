@@ -36,13 +36,15 @@ pub(crate) fn identity(node: &str) -> Identity {
     remapped(&[("__node", last), ("__ns", or_root(above))])
 }
 
-/// A rule for one node of a process alone.
-pub(crate) fn renamed(own: &str, node: &str) -> Identity {
-    let last = node.rsplit('/').next().unwrap_or(node);
-    match own == last {
-        true => Identity::default(),
-        false => remapped(&[(&format!("{own}:__node"), last)]),
-    }
+/// A rule for each node of a process that is called otherwise than by its program.
+pub(crate) fn renamed(nodes: &[(String, String)]) -> Identity {
+    let rules = nodes.iter().filter_map(|(own, node)| {
+        let last = node.rsplit('/').next().unwrap_or(node);
+        (own != last).then(|| (format!("{own}:__node"), last))
+    });
+    let rules: Vec<_> = rules.collect();
+    let rules: Vec<_> = rules.iter().map(|(from, to)| (&**from, *to)).collect();
+    remapped(&rules)
 }
 
 /// Where a rule stands before all others of a command line: rcl takes the first that fits.
@@ -173,10 +175,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_node_of_a_process_is_renamed_before_all_other_rules() {
-        assert_eq!(renamed("talker", "/front/talker"), Identity::default());
-        let told = renamed("talker", "/front/talker_2").arguments;
-        assert_eq!(told, ["--ros-args", "-r", "talker:__node:=talker_2"]);
+    fn nodes_of_a_process_are_renamed_one_by_one_and_before_all_other_rules() {
+        let told = |nodes: &[(&str, &str)]| {
+            let nodes = nodes
+                .iter()
+                .map(|(own, node)| ((*own).to_owned(), (*node).to_owned()));
+            renamed(&nodes.collect::<Vec<_>>()).arguments
+        };
+        assert_eq!(told(&[("talker", "/front/talker")]), [""; 0]);
+        let nodes = [
+            ("ears", "/front/ears_2"),
+            ("mouth", "/front/mouth"),
+            ("nose", "/nose_2"),
+        ];
+        let rules = ["-r", "ears:__node:=ears_2", "-r", "nose:__node:=nose_2"];
+        assert_eq!(told(&nodes), [&["--ros-args"], &rules[..]].concat());
         let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
         assert_eq!(first_rule(&argv("/x -v --ros-args -r __ns:=/front")), 2);
         assert_eq!(first_rule(&argv("/x -v")), 2);
