@@ -15,6 +15,7 @@
 
 pub mod components;
 pub mod egress;
+mod endings;
 mod ends;
 mod following;
 pub mod group;

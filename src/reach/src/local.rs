@@ -12,6 +12,7 @@ use servant::local::{LocalEngine, LocalServant};
 
 use crate::components::{Components, Wanted};
 use crate::egress::{self, Relays};
+use crate::endings::Endings;
 use crate::in_process::{Behind, InProcess};
 use crate::lifecycle::Lifecycles;
 use crate::links::Nodes;
@@ -76,6 +77,7 @@ impl Opener for LocalOpener {
         let registry = Arc::clone(&recorded.registry);
         let relays = self.relays(&local, &recorded.egress).await;
         let wanted = Wanted::new(recorded.components.clone(), Arc::clone(&registry));
+        let endings = Endings::follow(servant.events(), Arc::clone(&bus));
         let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
         let nodes: Arc<dyn Nodes> = Arc::new(nodes);
         let lifecycles = Lifecycles::follow(&bus, &nodes, &observer);
@@ -90,7 +92,7 @@ impl Opener for LocalOpener {
             registry,
             lifecycles,
             components,
-            keeps: Box::new(relays),
+            keeps: Box::new((relays, endings)),
         };
         Ok(Arc::new(InProcess::new(behind, options)))
     }

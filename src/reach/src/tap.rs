@@ -379,6 +379,10 @@ impl Bus for TappedBus {
         self.bus.shutdown_requested()
     }
 
+    fn process_ended(&self) {
+        self.bus.process_ended();
+    }
+
     async fn close(&self) {
         self.bus.close().await;
     }

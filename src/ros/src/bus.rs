@@ -222,6 +222,9 @@ pub trait Bus: Send + Sync + 'static {
     fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {
         None
     }
+    /// A process of this system is known to have ended: a bus that finds out by and by which nodes are gone looks at once. Nothing
+    /// to do where they are not found out about in this way.
+    fn process_ended(&self) {}
     /// Takes back everything registered and closes all connections. What is still held (subscriptions,
     /// publishers, guards) becomes inert.
     async fn close(&self) {}

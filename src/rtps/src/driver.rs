@@ -1,5 +1,8 @@
 //! Moves datagrams between sockets and the engine, and calls it when its time comes. One task for each participant.
 
+#[cfg(test)]
+mod tests;
+
 use std::io;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -25,7 +28,7 @@ use crate::network::Network;
 /// zero would stop.
 const SHORTEST: Duration = Duration::from_micros(10);
 /// How often it is looked which ports are bound.
-const PORTS: Duration = Duration::from_millis(200);
+pub(crate) const PORTS: Duration = Duration::from_millis(200);
 /// Datagrams that are taken at once from one socket, before others have their turn.
 const AT_ONCE: usize = 32;
 /// The longest datagram.
@@ -235,9 +238,20 @@ impl Shared {
         }
     }
 
+    /// Looks which ports are bound without waiting until it is time to.
+    pub fn look_now(&self) {
+        self.look_at_ports();
+        // Newcomers are told of us.
+        self.wake.notify_one();
+    }
+
+    /// Looks which ports are bound: who has come, and who is gone.
     fn look_at_ports(&self) {
         let mut core = self.core.lock();
         let Core { engine, flow, .. } = &mut *core;
+        if !flow.sees() {
+            return;
+        }
         let now = Instant::now();
         flow.tidy(now);
         match flow.bound(engine.ports_to_look_at()) {
@@ -247,8 +261,8 @@ impl Shared {
     }
 }
 
-/// Drives a participant until it is aborted.
-pub(crate) async fn drive(shared: Arc<Shared>) {
+/// Drives a participant until it is aborted. Each `look` it is looked which ports are bound.
+pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
     let timer = match timer() {
         Ok(timer) => timer,
         Err(error) => {
@@ -257,7 +271,7 @@ pub(crate) async fn drive(shared: Arc<Shared>) {
         }
     };
     let mut buffer = Vec::new();
-    let mut ports = tokio::time::interval(PORTS);
+    let mut ports = tokio::time::interval(look);
     ports.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let sees = shared.core.lock().flow.sees();
     loop {

@@ -146,6 +146,8 @@ pub(crate) struct Engine {
     deliveries: Vec<(Arc<dyn Sink>, Sample)>,
     tick_at: Instant,
     closed: bool,
+    /// It was said that there are more others than are heard.
+    crowded: bool,
 }
 
 impl Engine {
@@ -187,6 +189,7 @@ impl Engine {
             deliveries: Vec::new(),
             tick_at: now,
             closed: false,
+            crowded: false,
         };
         engine.add_builtin_ends();
         if engine.is_client() {
@@ -276,6 +279,7 @@ impl Engine {
     }
 
     /// Tells whoever waits, after something was changed from outside.
+    #[cfg(test)]
     pub fn settle(&mut self) {
         self.tell();
     }

@@ -20,8 +20,13 @@ pub(crate) fn count(length: usize) -> FragmentNumber {
 
 /// Fragments that came before the ones before them: at most so many are kept aside.
 const MOST_ASIDE: usize = 4096;
+/// What it takes to keep one of them, beside its bytes.
+const KEEPING: usize = 128;
+/// A shorter fragment that is kept aside is copied: it would keep its whole datagram, which may be so much longer.
+const COPIED: usize = 32 << 10;
 
-/// A sample that is not whole yet. What it holds grows with the bytes that have come, not with what was announced.
+/// A sample that is not whole yet. What it holds grows with the bytes that have come, not with what was announced, and all of it
+/// counts.
 #[derive(Debug)]
 pub(crate) struct Assembly {
     size: usize,
@@ -32,6 +37,9 @@ pub(crate) struct Assembly {
     /// The one that is to come next.
     next: FragmentNumber,
     aside: BTreeMap<FragmentNumber, Bytes>,
+    /// What `aside` takes.
+    held_aside: usize,
+    /// Counts `aside`, and the room that `whole` has.
     permit: Permit,
     /// When the last fragment came.
     pub heard: Instant,
@@ -71,6 +79,7 @@ impl Assembly {
             whole: Vec::new(),
             next: 1,
             aside: BTreeMap::new(),
+            held_aside: 0,
             permit,
             heard: now,
             related: None,
@@ -122,36 +131,53 @@ impl Assembly {
         if number < self.next || self.aside.contains_key(&number) {
             return true;
         }
-        if self
-            .permit
-            .grow_to(self.permit.bytes() + bytes.len())
-            .is_err()
-        {
+        if number > self.next {
+            return self.keep_aside(number, bytes);
+        }
+        if !self.append(&bytes) {
             return false;
         }
-        if number > self.next {
-            if self.aside.len() >= MOST_ASIDE {
+        while let Some(bytes) = self.aside.remove(&self.next) {
+            self.held_aside -= bytes.len() + KEEPING;
+            if !self.append(&bytes) {
                 return false;
             }
-            self.aside.insert(number, bytes);
-            return true;
-        }
-        self.append(&bytes);
-        while let Some(bytes) = self.aside.remove(&self.next) {
-            self.append(&bytes);
         }
         true
     }
 
-    fn append(&mut self, bytes: &[u8]) {
+    fn keep_aside(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
+        let held = bytes.len() + KEEPING;
+        if self.aside.len() >= MOST_ASIDE || !self.count(self.whole.capacity(), held) {
+            return false;
+        }
+        self.held_aside += held;
+        let bytes = match bytes.len() < COPIED {
+            true => Bytes::copy_from_slice(&bytes),
+            false => bytes,
+        };
+        self.aside.insert(number, bytes);
+        true
+    }
+
+    /// Counts so much room for the first fragments, and so much more aside; whether it fits.
+    fn count(&mut self, whole: usize, more: usize) -> bool {
+        self.permit.resize(whole + self.held_aside + more).is_ok()
+    }
+
+    fn append(&mut self, bytes: &[u8]) -> bool {
         if self.whole.capacity() - self.whole.len() < bytes.len() {
             // Twice what has come, at most the whole.
             let most = self.size - self.whole.len();
-            self.whole
-                .reserve_exact(self.whole.len().max(64 << 10).max(bytes.len()).min(most));
+            let more = self.whole.len().max(bytes.len()).min(most);
+            if !self.count(self.whole.len() + more, 0) {
+                return false;
+            }
+            self.whole.reserve_exact(more);
         }
         self.whole.extend_from_slice(bytes);
         self.next += 1;
+        true
     }
 
     /// Which fragments are missing among the first 256 from the first missing one on; all that are up to `last`.
@@ -168,7 +194,12 @@ impl Assembly {
 
     /// The whole sample, which counts in its budget until it is dropped.
     pub fn into_bytes(self) -> Bytes {
-        self.permit.around(self.whole)
+        let Self {
+            whole, mut permit, ..
+        } = self;
+        // Less than before, if anything: it cannot be refused.
+        let _ = permit.resize(whole.capacity());
+        permit.around(whole)
     }
 }
 
@@ -258,6 +289,40 @@ mod tests {
             Progress::Refused
         );
         drop(assembly);
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn what_is_kept_of_short_fragments_counts_as_what_it_takes() {
+        let budget = Budget::new("test", 1 << 20);
+        let mut assembly = Assembly::new(1 << 16, 1, 1 << 20, budget.permit(), Instant::now())
+            .expect("a size that fits");
+        let now = Instant::now();
+        let datagram = Bytes::from(vec![0; 60_000]);
+        for number in 2..2 + MOST_ASIDE as u32 {
+            assert_eq!(assembly.take(number, 1, &datagram, now), Progress::Missing);
+        }
+        assert!(datagram.is_unique(), "a byte keeps its datagram");
+        assert_eq!(budget.used(), MOST_ASIDE * (1 + KEEPING));
+        assert_eq!(assembly.take(1, 1, &datagram, now), Progress::Missing);
+        assert_eq!(assembly.next, 2 + MOST_ASIDE as u32);
+        assert!(assembly.whole.capacity() <= budget.used());
+        drop(assembly);
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn a_whole_sample_counts_as_its_bytes() {
+        let budget = Budget::new("test", 1 << 20);
+        let mut assembly = Assembly::new(3000, 1000, 1 << 20, budget.permit(), Instant::now())
+            .expect("a size that fits");
+        let now = Instant::now();
+        for number in [3, 2, 1] {
+            assembly.take(number, 1, &Bytes::from(vec![0; 1000]), now);
+        }
+        let whole = assembly.into_bytes();
+        assert_eq!((whole.len(), budget.used()), (3000, 3000));
+        drop(whole);
         assert_eq!(budget.used(), 0);
     }
 }

@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use crate::discovery::{EndpointData, ParticipantData};
-use crate::driver::{Shared, Sockets, drive};
+use crate::driver::{PORTS, Shared, Sockets, drive};
 use crate::engine::{BUILTIN, Engine, Settings};
 use crate::flow::Flow;
 use crate::locator::{MULTICAST, Ports};
@@ -225,6 +225,15 @@ impl Participant {
     /// # Errors
     /// There is no such domain, or no socket could be opened.
     pub async fn join(place: Arc<dyn Place>, config: Config) -> Result<Participant, JoinError> {
+        Self::join_looking(place, config, PORTS).await
+    }
+
+    /// The same; each `ports_each` it is looked which ports are bound.
+    pub(crate) async fn join_looking(
+        place: Arc<dyn Place>,
+        config: Config,
+        ports_each: Duration,
+    ) -> Result<Participant, JoinError> {
         let ports = Ports::of(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
         let network = look(&*place, &config.interfaces).await;
         let here = match &config.interfaces {
@@ -286,7 +295,7 @@ impl Participant {
             multicast,
         };
         let shared = Shared::new(engine, flow, sockets, network);
-        let task = tokio::spawn(drive(Arc::clone(&shared))).abort_handle();
+        let task = tokio::spawn(drive(Arc::clone(&shared), ports_each)).abort_handle();
         let looking = (!config.interfaces.is_loopback()).then(|| {
             let looking = look_again(Arc::clone(&shared), place, config.interfaces);
             tokio::spawn(looking).abort_handle()
@@ -341,12 +350,10 @@ impl Participant {
         }
     }
 
-    /// This participant is known to be dead: its ends are gone at once, not when its lease is over.
-    pub fn forget(&self, participant: GuidPrefix) {
-        self.running.shared.with(|_, engine| {
-            engine.participant_gone(participant);
-            engine.settle();
-        });
+    /// A process of this machine is known to have ended: whoever had ports there is gone at once, not when it is time to look at
+    /// ports again. Changes nothing where the kernel cannot be asked.
+    pub fn look_at_ports(&self) {
+        self.running.shared.look_now();
     }
 
     /// Returns once readers have all that was written to them.

@@ -6,6 +6,9 @@
 //!   HEARTBEAT ─────────────┴─▶ ACKNACK, NACK_FRAG
 //! ```
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -38,6 +41,8 @@ const ACKNOWLEDGE: Duration = Duration::from_millis(5);
 const MOST_ASSEMBLIES: usize = 8;
 /// Samples that wait for one before them.
 const MOST_WAITING: usize = SPAN as usize;
+/// What it takes to keep a sample, beside its bytes: many small ones count, too.
+const KEEPING: usize = 256;
 
 /// What holds for all readers of a participant.
 #[derive(Debug, Clone)]
@@ -69,8 +74,8 @@ struct WriterProxy {
     /// Whether `next` is known: a reliable writer tells it by its first heartbeat.
     begun: bool,
     matched: Instant,
-    /// Numbers after `next`: samples, or the word that there is none.
-    waiting: BTreeMap<SequenceNumber, Option<Sample>>,
+    /// Numbers after `next`: samples, or the word that there is none, which costs hardly anything.
+    waiting: BTreeMap<SequenceNumber, Option<Box<Sample>>>,
     assemblies: BTreeMap<SequenceNumber, Assembly>,
     /// The last number that the writer has told of.
     last: SequenceNumber,
@@ -164,8 +169,16 @@ impl ReaderState {
     }
 
     /// A whole sample. True where this shows for the first time that the writer knows this reader.
-    pub fn data(&mut self, writer: Guid, sample: Sample, out: &mut Vec<Sample>) -> bool {
-        let max_sample = self.bounds.max_sample;
+    pub fn data(
+        &mut self,
+        now: Instant,
+        writer: Guid,
+        sample: Sample,
+        out: &mut Vec<Sample>,
+    ) -> bool {
+        let Bounds {
+            max_sample, budget, ..
+        } = &self.bounds;
         let Some(proxy) = self
             .proxies
             .iter_mut()
@@ -173,12 +186,21 @@ impl ReaderState {
         else {
             return false;
         };
-        if sample.payload.len() > max_sample {
+        if sample.payload.len() > *max_sample {
             self.refused += 1;
             return false;
         }
-        proxy.assemblies.remove(&sample.number);
-        proxy.take(sample, out);
+        let number = sample.number;
+        match proxy.counted(sample, budget) {
+            Some(sample) => {
+                proxy.assemblies.remove(&number);
+                proxy.take(sample, out);
+            }
+            None => {
+                self.refused += 1;
+                proxy.ask_again(now, number);
+            }
+        }
         !std::mem::replace(&mut proxy.heard, true)
     }
 
@@ -258,8 +280,12 @@ impl ReaderState {
             Progress::Refused => {
                 self.refused += 1;
                 proxy.assemblies.remove(&number);
-                if !proxy.reliable {
-                    proxy.pass_over(number, out);
+                if proxy.reliable {
+                    // What waits for this one may take the room that it needs; the newest of them is sent once more.
+                    if proxy.waiting.keys().next_back() > Some(&number) {
+                        proxy.waiting.pop_last();
+                    }
+                    proxy.ask_again(now, number);
                 }
             }
             Progress::Whole => {
@@ -282,8 +308,7 @@ impl ReaderState {
         }
         if proxy.reliable && !proxy.assemblies.is_empty() {
             // Should the rest not come, it is asked for.
-            proxy.last = proxy.last.max(number);
-            proxy.answer_at = Some(proxy.answer_at.unwrap_or(now + ASK_AGAIN));
+            proxy.ask_again(now, number);
         }
         heard
     }
@@ -423,6 +448,33 @@ impl WriterProxy {
         }
     }
 
+    /// This number is missing: it is asked for after a while, unless it comes.
+    fn ask_again(&mut self, now: Instant, number: SequenceNumber) {
+        self.last = self.last.max(number);
+        self.answer_at = Some(self.answer_at.unwrap_or(now + ASK_AGAIN));
+    }
+
+    /// The same sample, counted in the budget if it has to wait for others; none if there is no room for it. A writer that
+    /// never says where it begins, or leaves a hole, would have others kept for as long as it likes.
+    fn counted(&self, sample: Sample, budget: &Budget) -> Option<Sample> {
+        let passes = !self.reliable || self.begun && sample.number <= self.next;
+        if passes || !self.has_place(sample.number) {
+            return Some(sample);
+        }
+        let permit = budget.take(sample.payload.len() + KEEPING).ok()?;
+        // A part of a datagram keeps all of it.
+        let payload = permit.around(sample.payload.to_vec());
+        Some(Sample { payload, ..sample })
+    }
+
+    /// Whether this number would be kept, if it has to wait.
+    fn has_place(&self, number: SequenceNumber) -> bool {
+        let far = self.begun && number.0 - self.next.0 >= MOST_WAITING as i64;
+        let full = self.waiting.len() >= MOST_WAITING && number != self.next;
+        number >= self.next && !far && !full && !self.waiting.contains_key(&number)
+    }
+
+    /// Takes a sample that counts in the budget already, or need not wait.
     fn take(&mut self, sample: Sample, out: &mut Vec<Sample>) {
         let number = sample.number;
         if number < self.next {
@@ -435,14 +487,13 @@ impl WriterProxy {
             return;
         }
         self.last = self.last.max(number);
-        if number.0 - self.next.0 >= MOST_WAITING as i64 && self.begun {
-            return;
+        if self.begun && number == self.next {
+            self.next = number.next();
+            out.push(sample);
+            self.pass_on(out);
+        } else if self.has_place(number) {
+            self.waiting.insert(number, Some(Box::new(sample)));
         }
-        if self.waiting.len() >= MOST_WAITING && number != self.next {
-            return;
-        }
-        self.waiting.insert(number, Some(sample));
-        self.pass_on(out);
     }
 
     /// A sample that will not be taken, however often it is sent.
@@ -471,7 +522,8 @@ impl WriterProxy {
         out.extend(
             std::mem::replace(&mut self.waiting, later)
                 .into_values()
-                .flatten(),
+                .flatten()
+                .map(|sample| *sample),
         );
         self.assemblies = self.assemblies.split_off(&first);
         self.next = first;
@@ -489,7 +541,7 @@ impl WriterProxy {
         {
             let (number, sample) = entry.remove_entry();
             self.next = self.next.max(number.next());
-            out.extend(sample);
+            out.extend(sample.map(|sample| *sample));
         }
     }
 

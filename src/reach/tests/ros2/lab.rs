@@ -75,11 +75,16 @@ impl Lab {
 
     /// The same, where more than `lo` is meant.
     pub async fn join_network(&self, node: &str, network: Network) -> Arc<Ros2Bus> {
-        let sockets = Arc::new(Inside(Arc::clone(&self.network)));
         let options = JoinOptions {
             network,
             ..JoinOptions::in_domain(0, node)
         };
+        self.join_with(options).await
+    }
+
+    /// The same, by these options.
+    pub async fn join_with(&self, options: JoinOptions) -> Arc<Ros2Bus> {
+        let sockets = Arc::new(Inside(Arc::clone(&self.network)));
         let joined = Ros2Bus::connect(sockets, options).await;
         joined.expect("a bus")
     }

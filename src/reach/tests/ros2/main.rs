@@ -2,6 +2,7 @@
 
 mod actions;
 mod cyclone;
+mod killed;
 mod lab;
 mod lifecycle;
 mod links;

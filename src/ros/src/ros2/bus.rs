@@ -360,6 +360,10 @@ impl Bus for Ros2Bus {
         Ok(self)
     }
 
+    fn process_ended(&self) {
+        self.inner.participant.look_at_ports();
+    }
+
     async fn close(&self) {
         if self.inner.closed.swap(true, Ordering::AcqRel) {
             return;

@@ -1,6 +1,7 @@
 //! Two buses of one process, which meet on the loopback of this machine.
 
 mod graph;
+mod hostile;
 mod services;
 mod topics;
 

@@ -26,6 +26,9 @@ const KNOWN: [u16; 13] = {
     ]
 };
 
+/// Names and user data of more bytes are not understood. ROS 2's are at most 255 and 72 long; many such ends may be told.
+const LONGEST: usize = 1024;
+
 impl EndpointData {
     /// As the payload of a sample. Names or user data of more than 65,527 bytes are left out.
     pub fn to_bytes(&self) -> Bytes {
@@ -71,9 +74,11 @@ impl EndpointData {
         let mut input = list(payload)?;
         while let Some((number, mut value)) = parameter(&mut input, &KNOWN)? {
             match number {
-                pid::TOPIC_NAME => topic = Some(value.text(number)?.to_owned()),
-                pid::TYPE_NAME => type_name = Some(value.text(number)?.to_owned()),
-                pid::USER_DATA => data.user_data = Bytes::copy_from_slice(value.counted()?),
+                pid::TOPIC_NAME => topic = Some(short(number, value.text(number)?)?.to_owned()),
+                pid::TYPE_NAME => type_name = Some(short(number, value.text(number)?)?.to_owned()),
+                pid::USER_DATA => {
+                    data.user_data = Bytes::copy_from_slice(short(number, value.counted()?)?)
+                }
                 pid::UNICAST_LOCATOR => keep(&mut data.unicast, value.locator()?),
                 pid::EXPECTS_INLINE_QOS => data.expects_inline_qos = value.byte()? != 0,
                 _ => policies::take(&mut data.qos, number, value)?,
@@ -82,6 +87,13 @@ impl EndpointData {
         data.topic = topic.ok_or(WireError::Missing(pid::TOPIC_NAME))?;
         data.type_name = type_name.ok_or(WireError::Missing(pid::TYPE_NAME))?;
         Ok(data)
+    }
+}
+
+fn short<T: AsRef<[u8]> + ?Sized>(number: u16, value: &T) -> Result<&T, WireError> {
+    match value.as_ref().len() <= LONGEST {
+        true => Ok(value),
+        false => Err(WireError::Value(number)),
     }
 }
 

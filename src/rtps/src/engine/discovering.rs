@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::servers::{SPARE, Via};
 use super::{Datagram, Engine, LocalReader, LocalWriter, Remote};
 use crate::discovery::{self, EndpointData, ParticipantData};
-use crate::participant::Sample;
+use crate::participant::{Discovered, Sample};
 use crate::reader::ReaderState;
 use crate::wire::{self, InlineQos};
 use crate::writer::{Change, WriterState};
@@ -25,7 +25,7 @@ pub(super) const LAST_PAUSE: Duration = Duration::from_secs(3);
 const TOLD_AGAIN: Duration = Duration::from_millis(50);
 /// More participants, and more ends of each, are not kept.
 pub(super) const MOST_PARTICIPANTS: usize = 256;
-const MOST_ENDS: usize = 16_384;
+pub(super) const MOST_ENDS: usize = 16_384;
 /// Ends that were taken back are told to newcomers, but not for ever.
 const MOST_WITHDRAWN: usize = 64;
 
@@ -253,12 +253,17 @@ impl Engine {
         if !fits {
             return;
         }
-        let ends = self.discovered.writers.len() + self.discovered.readers.len();
-        if ends >= MOST_ENDS {
-            tracing::warn!(
-                "more than {MOST_ENDS} DDS writers and readers; that of topic {} is not heard",
-                told.topic
-            );
+        let Discovered {
+            writers, readers, ..
+        } = &self.discovered;
+        let known = writers.contains_key(&told.guid) || readers.contains_key(&told.guid);
+        if !known && writers.len() + readers.len() >= MOST_ENDS {
+            if !std::mem::replace(&mut self.crowded, true) {
+                tracing::warn!(
+                    "more than {MOST_ENDS} DDS writers and readers; that of topic {} is not heard, nor are others",
+                    told.topic
+                );
+            }
             return;
         }
         self.end_came(now, Arc::new(told));

@@ -70,7 +70,7 @@ impl Engine {
                             written,
                             withdrawn,
                         };
-                        reader.state.data(writer, sample, out)
+                        reader.state.data(now, writer, sample, out)
                     } else {
                         reader.state.nothing(writer, data.number, out);
                         false

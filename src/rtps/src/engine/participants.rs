@@ -2,6 +2,9 @@
 
 #![forbid(unsafe_code)]
 
+#[cfg(test)]
+mod tests;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
@@ -98,10 +101,12 @@ impl Engine {
             self.participant_gone(prefix);
         }
         if self.remotes.len() >= MOST_PARTICIPANTS {
-            tracing::warn!(
-                "more than {MOST_PARTICIPANTS} DDS participants; {:?} is not heard",
-                told.prefix
-            );
+            if !std::mem::replace(&mut self.crowded, true) {
+                tracing::warn!(
+                    "more than {MOST_PARTICIPANTS} DDS participants; {:?} is not heard, nor are others",
+                    told.prefix
+                );
+            }
             return;
         }
         let user = self

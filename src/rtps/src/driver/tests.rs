@@ -1,0 +1,82 @@
+//! Whose process has ended is gone at once, where somebody says that one has.
+
+use std::net::{Ipv4Addr, SocketAddr};
+
+use async_trait::async_trait;
+use socket2::{Domain, Protocol, Socket, Type};
+use tokio::time::timeout;
+
+use super::*;
+use crate::{Config, Participant, Place};
+
+/// The network namespace of this process.
+struct Here;
+
+#[async_trait]
+impl Place for Here {
+    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        let socket = Socket::new(Domain::IPV4, Type::DGRAM.nonblocking(), None)?;
+        socket.set_reuse_address(shared)?;
+        socket.bind(&address.into())?;
+        UdpSocket::from_std(socket.into())
+    }
+
+    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        // AF_NETLINK and NETLINK_SOCK_DIAG.
+        let socket = Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4)))?;
+        Ok(Some(socket.into()))
+    }
+}
+
+const HOUR: Duration = Duration::from_secs(3600);
+/// Only bounds how long a failing test takes.
+const LONG: Duration = Duration::from_secs(60);
+
+/// A domain that no other test of this process uses; those of `tests/loopback.rs` are above.
+fn domain() -> u16 {
+    (std::process::id() % 90) as u16
+}
+
+async fn join() -> Participant {
+    // Where others look for it: it is seen to come.
+    let config = Config {
+        well_known: true,
+        ..Config::new(domain(), "test")
+    };
+    Participant::join_looking(Arc::new(Here), config, HOUR)
+        .await
+        .expect("a participant")
+}
+
+#[tokio::test]
+async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
+    let (here, killed) = (join().await, join().await);
+    let prefix = killed.guid().prefix;
+    let mut discovered = here.discovered();
+    let known = discovered.wait_for(|all| all.participants.contains_key(&prefix));
+    let at = {
+        let known = timeout(LONG, known).await.expect("in time");
+        let known = known.expect("it runs");
+        known.participants[&prefix].discovery[0]
+            .udp()
+            .expect("an address")
+    };
+    // Its sockets are closed without a word.
+    drop(killed);
+    let at = SocketAddr::from((Ipv4Addr::UNSPECIFIED, at.port()));
+    let closed = async {
+        while std::net::UdpSocket::bind(at).is_err() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    timeout(LONG, closed).await.expect("its port is free");
+    let there = || {
+        here.discovered()
+            .borrow()
+            .participants
+            .contains_key(&prefix)
+    };
+    assert!(there(), "nobody has looked");
+    here.look_at_ports();
+    assert!(!there());
+}
