@@ -66,6 +66,8 @@ mod inside;
 mod isolation;
 #[path = "stories/launched.rs"]
 mod launched;
+#[path = "stories/lifecycle.rs"]
+mod lifecycle;
 #[path = "stories/link.rs"]
 mod link;
 #[path = "stories/memory.rs"]
@@ -380,6 +382,7 @@ fn main() -> ExitCode {
             pictures_are_made_smaller_where_the_link_is_slow,
             a_robot_of_the_other_ros_is_refused_by_name,
         ],
+        stories![lifecycle: nodes_of_a_servant_become_active_and_share_their_memory],
         stories![memory:
             what_is_begun_and_never_ended_costs_its_owner,
         ],
