@@ -106,6 +106,8 @@ mod readiness;
 mod recordings;
 #[path = "stories/refusals.rs"]
 mod refusals;
+#[path = "stories/robot_network.rs"]
+mod robot_network;
 #[path = "stories/rollouts.rs"]
 mod rollouts;
 #[path = "stories/ros2.rs"]
@@ -383,6 +385,11 @@ fn main() -> ExitCode {
             a_robot_of_the_other_ros_is_refused_by_name,
         ],
         stories![lifecycle: nodes_of_a_servant_become_active_and_share_their_memory],
+        stories![robot_network:
+            another_machine_finds_a_stub_by_multicast,
+            another_machine_finds_a_stub_by_a_server_that_comes_later_and_again,
+            another_machine_with_cyclone_dds_finds_a_stub,
+        ],
         stories![memory:
             what_is_begun_and_never_ended_costs_its_owner,
         ],

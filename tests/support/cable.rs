@@ -7,9 +7,10 @@
 //! Kernels with netem degrade it by themselves (a veth pair, `tc qdisc … netem`). Where netem was left out, both ends
 //! are TUN devices, and [`shaper`](crate::shaper) treats packets by the same rules between them.
 
+use std::fs::File;
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -211,17 +212,23 @@ impl Cable {
         ip(&[&["-n", &self.name], arguments].concat())
     }
 
-    /// A socket of the server's end. A thread enters the namespace and ends there.
+    /// A socket of the server's end.
     fn listen(&self, address: &str) -> anyhow::Result<TcpListener> {
-        let path = self.namespace();
-        let place = std::fs::File::open(&path).with_context(|| path.display().to_string())?;
         let address = format!("{address}:0");
-        let made = std::thread::spawn(move || -> anyhow::Result<TcpListener> {
-            nix::sched::setns(&place, CloneFlags::CLONE_NEWNET)?;
-            Ok(TcpListener::bind(address)?)
-        });
-        made.join().expect("the thread does not panic")
+        Ok(within(&self.namespace(), || TcpListener::bind(address))??)
     }
+}
+
+/// Does something in a network namespace: a thread enters it and ends there. What it starts stays there.
+pub fn within<T: Send>(namespace: &Path, act: impl FnOnce() -> T + Send) -> anyhow::Result<T> {
+    let place = File::open(namespace).with_context(|| namespace.display().to_string())?;
+    std::thread::scope(|scope| {
+        let acting = scope.spawn(move || {
+            nix::sched::setns(&place, CloneFlags::CLONE_NEWNET)?;
+            Ok(act())
+        });
+        acting.join().expect("the thread does not panic")
+    })
 }
 
 impl Drop for Cable {
@@ -290,7 +297,8 @@ fn tc(arguments: &[&str]) -> anyhow::Result<()> {
     run("tc", arguments)
 }
 
-fn ip(arguments: &[&str]) -> anyhow::Result<()> {
+/// Runs `ip`.
+pub fn ip(arguments: &[&str]) -> anyhow::Result<()> {
     run("ip", arguments)
 }
 

@@ -18,6 +18,7 @@ pub mod people;
 pub mod procfs;
 pub mod provider;
 pub mod robot;
+pub mod robot_network;
 pub mod ros_system;
 pub mod shaper;
 pub mod site;

@@ -60,7 +60,17 @@ pub enum RosSystem {
 pub struct Domain {
     /// `ROS_DOMAIN_ID`.
     pub id: u16,
-    _lock: UnixListener,
+    range: Range,
+    /// Networks of a test's own need none.
+    _lock: Option<UnixListener>,
+}
+
+/// Whom a domain's nodes look for.
+enum Range {
+    /// Those of this machine.
+    Machine,
+    /// Those of all networks, by these discovery servers, or by multicast.
+    Network { servers: Option<String> },
 }
 
 impl Domain {
@@ -77,18 +87,43 @@ impl Domain {
             let address = UnixAddress::from_abstract_name(name).ok()?;
             let lock = UnixListener::bind_addr(&address).ok()?;
             let id = u16::try_from(id).ok()?;
-            Some(Self { id, _lock: lock })
+            Some(Self {
+                id,
+                range: Range::Machine,
+                _lock: Some(lock),
+            })
         });
         taken.context("all domains of ROS 2 are taken; end what is left of earlier runs")
     }
 
-    /// Has a process join it, and reach nobody but this machine.
+    /// One of networks of a test's own, where processes find each other by these discovery servers, or by multicast.
+    pub fn of_network(id: u16, servers: Option<&str>) -> Self {
+        Self {
+            id,
+            range: Range::Network {
+                servers: servers.map(str::to_owned),
+            },
+            _lock: None,
+        }
+    }
+
+    /// Has a process join it.
     pub fn is_of(&self, command: &mut Command) {
         command
             .env("ROS_DOMAIN_ID", self.id.to_string())
-            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            .env_remove("ROS_LOCALHOST_ONLY")
+            .env_remove("ROS_AUTOMATIC_DISCOVERY_RANGE")
             .env_remove("ROS_DISCOVERY_SERVER")
             .env_remove("ROS_STATIC_PEERS");
+        match &self.range {
+            Range::Machine => {
+                command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
+            }
+            Range::Network { servers } => {
+                let servers = servers.iter();
+                command.envs(servers.map(|list| ("ROS_DISCOVERY_SERVER", list)));
+            }
+        }
     }
 }
 

@@ -22,10 +22,11 @@ use tempfile::TempDir;
 use tokio::runtime::Runtime;
 
 use crate::binaries;
+use crate::cable::within;
 use crate::daemon::Daemon;
 use crate::deployer::path_str;
 use crate::robot::PATIENCE;
-use crate::ros_system::{Node, RosSystem};
+use crate::ros_system::{Domain, Node, RosSystem};
 
 /// A robot.
 pub struct Site {
@@ -33,6 +34,8 @@ pub struct Site {
     pub runtime: Runtime,
     /// Its ROS.
     pub system: RosSystem,
+    /// Where its processes run, if not in this machine's own network.
+    namespace: Option<PathBuf>,
     place: TempDir,
 }
 
@@ -50,6 +53,18 @@ impl Site {
 
     /// A robot of this ROS, without a node.
     pub fn of(version: RosVersion) -> anyhow::Result<Self> {
+        Self::made(None, |runtime| RosSystem::new(version, runtime))
+    }
+
+    /// A robot of ROS 2 whose processes run in a network namespace; none of this process can join them.
+    pub fn inside(namespace: PathBuf, domain: Domain) -> anyhow::Result<Self> {
+        Self::made(Some(namespace), |_| Ok(RosSystem::Domain(domain)))
+    }
+
+    fn made(
+        namespace: Option<PathBuf>,
+        system: impl FnOnce(&Runtime) -> anyhow::Result<RosSystem>,
+    ) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -58,8 +73,9 @@ impl Site {
             .prefix("cloudroid-site-")
             .tempdir()?;
         Ok(Self {
-            system: RosSystem::new(version, &runtime)?,
+            system: system(&runtime)?,
             runtime,
+            namespace,
             place,
         })
     }
@@ -422,12 +438,15 @@ impl Site {
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {
         let file = File::create(log)?;
         self.system.is_of(&mut command);
-        let child = command
+        command
             .stdin(Stdio::null())
             .stdout(file.try_clone()?)
-            .stderr(file)
-            .spawn()
-            .context("starting a node")?;
+            .stderr(file);
+        let spawned = match &self.namespace {
+            Some(namespace) => within(namespace, || command.spawn())?,
+            None => command.spawn(),
+        };
+        let child = spawned.context("starting a node")?;
         Ok(Running {
             child,
             log: log.to_owned(),

@@ -105,6 +105,13 @@ pub const HERALD: Service = Service {
     arguments: &["--name", "herald", "--node", "herald/herald"],
 };
 
+/// Our package of ROS 2 that carries letters, and calls its robot while it is called.
+pub const COURIER: Service = Service {
+    name: "courier_ros2",
+    package: Some("courier_ros2"),
+    arguments: &["--node", "courier"],
+};
+
 /// Our C++ package that calls services of others.
 pub const CALLER: Service = Service {
     name: "caller_cpp",

@@ -8,7 +8,6 @@ use ros::bus::{Bus, Qos, reaches};
 use ros::ros2::Ros2Bus;
 use ros::{DiscoveryServer, Interfaces, Network};
 use serde_json::json as value;
-use tempfile::TempDir;
 use tokio::time::timeout;
 
 use super::lab::{LONG, Lab, Peer, json, of_string, said, shows, string};
@@ -22,35 +21,11 @@ const TUNED: &str = "/lab/tuned";
 struct Server {
     place: u8,
     at: Ipv4Addr,
-    profiles: TempDir,
 }
 
 impl Server {
-    /// One that makes a participant of Fast DDS a server by a profile.
     fn of(place: u8, at: Ipv4Addr) -> Self {
-        let profiles = tempfile::tempdir().expect("a directory");
-        let profile = format!(
-            r#"<?xml version="1.0" encoding="UTF-8"?>
-<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
-<participant profile_name="server" is_default_profile="true"><rtps>
-<prefix>44.53.{place:02x}.5f.45.50.52.4f.53.49.4d.41</prefix>
-<builtin>
-<discovery_config><discoveryProtocol>SERVER</discoveryProtocol></discovery_config>
-<metatrafficUnicastLocatorList><locator><udpv4>
-<address>{at}</address><port>{port}</port>
-</udpv4></locator></metatrafficUnicastLocatorList>
-</builtin>
-</rtps></participant>
-</profiles></dds>
-"#,
-            port = 11811 + u16::from(place),
-        );
-        std::fs::write(profiles.path().join("server.xml"), profile).expect("a profile");
-        Self {
-            place,
-            at,
-            profiles,
-        }
+        Self { place, at }
     }
 
     fn here(place: u8) -> Self {
@@ -62,10 +37,9 @@ impl Server {
     }
 
     async fn starts(&self, lab: &Lab) -> Peer {
-        let profile = self.profiles.path().join("server.xml");
-        let profile = profile.to_str().expect("a path of text");
-        let environment = [("FASTRTPS_DEFAULT_PROFILES_FILE", profile)];
-        lab.node_with("server.py", &[], &environment).await
+        let arguments = [self.place.to_string(), self.at.to_string()];
+        lab.node("server.py", &arguments.each_ref().map(String::as_str))
+            .await
     }
 }
 
