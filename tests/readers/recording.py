@@ -1,4 +1,4 @@
-"""Reads an MCAP file with the format's own Python package, or makes one that no servant takes.
+"""Reads an MCAP file with the format's own Python packages, or makes one that no servant of ROS 1 takes.
 
 usage: recording.py read FILE       prints its profile, its topics and the texts of each topic of strings, as JSON
        recording.py foreign FILE    writes one message of ROS 2
@@ -9,21 +9,34 @@ import sys
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_ros1.decoder import DecoderFactory
+from mcap_ros1.decoder import DecoderFactory as Ros1
+from mcap_ros2.decoder import DecoderFactory as Ros2
+
+
+# How messages and their definitions are written, and what reads them.
+FORMATS = {"ros1": ("ros1", "ros1msg", Ros1()), "ros2": ("cdr", "ros2msg", Ros2())}
 
 
 def read(file):
-    reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    reader = make_reader(file)
+    profile = reader.get_header().profile
+    encoding, schema_encoding, decoders = FORMATS[profile]
     topics, texts = {}, {}
-    for schema, channel, message, decoded in reader.iter_decoded_messages():
-        assert channel.message_encoding == "ros1" and schema.encoding == "ros1msg", channel
+    for schema, channel, message in reader.iter_messages():
+        assert channel.message_encoding == encoding and schema.encoding == schema_encoding, channel
         topics[channel.topic] = schema.name
-        if schema.name == "std_msgs/String":
+        # The package for ROS 2 has no wide strings.
+        if b"wstring" in schema.data:
+            continue
+        decoded = decoders.decoder_for(encoding, schema)(message.data)
+        if schema.name in ("std_msgs/String", "std_msgs/msg/String"):
             texts.setdefault(channel.topic, []).append(decoded.data)
         elif channel.topic == "/sights/map":
             assert decoded.info.width == 100 and len(decoded.data) == 6000
+        elif channel.topic == "/square":
+            assert decoded.header.frame_id == "floor" and decoded.polygon.points[2].y == 1.5
     counted = sum(reader.get_summary().statistics.channel_message_counts.values())
-    print(json.dumps({"profile": reader.get_header().profile, "topics": topics, "texts": texts, "messages": counted}))
+    print(json.dumps({"profile": profile, "topics": topics, "texts": texts, "messages": counted}))
 
 
 def foreign(file):

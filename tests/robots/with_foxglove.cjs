@@ -4,75 +4,15 @@
 // usage: node with_foxglove.cjs URL acts|looks   (NODE_PATH names where the packages are)
 'use strict';
 const assert = require('node:assert');
-const { FoxgloveClient } = require('@foxglove/ws-protocol');
 const { parse } = require('@foxglove/rosmsg');
 const { MessageReader, MessageWriter } = require('@foxglove/rosmsg-serialization');
-const WebSocket = require('ws');
+const { Viewer, check, runs } = require('./foxglove_viewer.cjs');
 
 const [url, part] = process.argv.slice(2);
-setTimeout(() => { console.error('it took too long'); process.exit(1); }, 60_000).unref();
-const check = (what, truth) => { assert(truth, what); console.log(what); };
-
-// Waits for things that are told in any order: what was told before counts, too.
-class Told {
-  constructor() { this.all = []; this.waiting = []; }
-  tell(what) { this.all.push(what); this.waiting.splice(0).forEach((wake) => wake()); }
-  async next(wanted) {
-    for (;;) {
-      const at = this.all.findIndex(wanted);
-      if (at >= 0) return this.all.splice(at, 1)[0];
-      await new Promise((resolve) => this.waiting.push(resolve));
-    }
-  }
-}
-
-class Viewer {
-  constructor() {
-    this.client = new FoxgloveClient({ ws: new WebSocket(url, [FoxgloveClient.SUPPORTED_SUBPROTOCOL, 'foxglove.sdk.v1']) });
-    for (const event of ['serverInfo', 'status', 'message', 'serviceCallResponse', 'serviceCallFailure', 'parameterValues', 'connectionGraphUpdate']) {
-      this[event] = new Told();
-      this.client.on(event, (what) => this[event].tell(what));
-    }
-    this.channels = new Told();
-    this.client.on('advertise', (all) => all.forEach((one) => this.channels.tell(one)));
-    this.services = new Told();
-    this.client.on('advertiseServices', (all) => all.forEach((one) => this.services.tell(one)));
-    this.client.on('error', (error) => { console.error('error', error); process.exit(1); });
-  }
-  channel(topic) { return this.channels.next((one) => one.topic === topic); }
-  service(name) { return this.services.next((one) => one.name === name); }
-  async subscribes(topic) {
-    const channel = await this.channel(topic);
-    assert.equal(channel.encoding, 'ros1');
-    assert.equal(channel.schemaEncoding, 'ros1msg');
-    const reader = new MessageReader(parse(channel.schema));
-    const id = this.client.subscribe(channel.id);
-    return { id, next: async () => {
-      const message = await this.message.next((one) => one.subscriptionId === id);
-      return { at: message.timestamp, says: reader.readMessage(message.data) };
-    } };
-  }
-  async calls(service, bytes, encoding = 'ros1') {
-    const callId = Viewer.calls = (Viewer.calls ?? 0) + 1;
-    this.client.sendServiceCallRequest({ serviceId: service.id, callId, encoding, data: new DataView(bytes.buffer) });
-    return Promise.race([
-      this.serviceCallResponse.next((one) => one.callId === callId),
-      this.serviceCallFailure.next((one) => one.callId === callId),
-    ]);
-  }
-  async parameter(name) {
-    const id = `get ${name} ${Math.random()}`;
-    this.client.getParameters([name], id);
-    return (await this.parameterValues.next((one) => one.id === id)).parameters[0];
-  }
-  async refused(words) {
-    const { message } = await this.status.next((one) => one.message.includes(words));
-    console.log(`refused: ${message}`);
-  }
-}
+const ROS = { encoding: 'ros1', schema: 'ros1msg', reader: (schema) => new MessageReader(parse(schema)) };
 
 async function main() {
-  const viewer = new Viewer();
+  const viewer = new Viewer(url, ROS);
   const info = await viewer.serverInfo.next(() => true);
   check(`the servant of ${info.name}`, info.name.startsWith('rover at sights_py ('));
   for (const can of ['clientPublish', 'services', 'parameters', 'connectionGraph']) assert(info.capabilities.includes(can), can);
@@ -85,7 +25,7 @@ async function main() {
   viewer.client.unsubscribe(image.id);
   const map = await viewer.subscribes('/sights/map');
   check('a map that was latched', (await map.next()).says.info.width === 100);
-  const other = new Viewer();
+  const other = new Viewer(url, ROS);
   const same = await other.subscribes('/sights/map');
   check('the map for a second viewer', (await same.next()).says.info.height === 60);
   other.client.close();
@@ -146,8 +86,6 @@ async function main() {
     check('a list', (await viewer.parameter('/sights/names')).value.join() === 'a,b');
   }
   viewer.client.close();
-  console.log('done');
-  process.exit(0);
 }
 
-main().catch((error) => { console.error(error); process.exit(1); });
+runs(main);

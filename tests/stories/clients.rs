@@ -13,12 +13,16 @@ use support::{Verdict, binaries};
 
 use crate::access::{daemon, token};
 
+/// The clients' programs.
+const ROSLIBPY: &str = "with_roslibpy.py";
+const ROSLIB: &str = "with_roslib.cjs";
+
 pub fn roslibpy_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(roslibpy(), "roslibpy")
+    finds_nothing_missing(roslibpy(ROSLIBPY), "roslibpy")
 }
 
 pub fn roslib_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(roslib(), "roslib")
+    finds_nothing_missing(roslib(ROSLIB), "roslib")
 }
 
 pub fn roslibrust_finds_nothing_missing() -> Verdict {
@@ -31,14 +35,14 @@ pub fn clients_with_tokens_find_nothing_missing() -> Verdict {
     let push = [&["push", package.as_str()], FIXTURE.arguments].concat();
     daemon.deployer().types(&push)?.succeeded()?;
     for (command, name) in [
-        (roslibpy(), "roslibpy"),
-        (roslib(), "roslib"),
+        (roslibpy(ROSLIBPY), "roslibpy"),
+        (roslib(ROSLIB), "roslib"),
         (roslibrust(), "roslibrust"),
     ] {
         let scope = ["--role", "robot", "--service", FIXTURE.name, "--robot"];
         let token = token(&daemon, &[&[name], &scope[..], &[name]].concat())?;
         let path = format!("{}?token={token}", FIXTURE.name);
-        does_all(&daemon, command, name, &path)?;
+        does_all(&daemon, command, (FIXTURE, name), &[daemon.url(&path)])?;
     }
     Ok(())
 }
@@ -49,20 +53,20 @@ fn package_of(service: Service) -> anyhow::Result<String> {
     Ok(path_str(&package).to_owned())
 }
 
-fn roslibpy() -> Command {
+pub fn roslibpy(name: &str) -> Command {
     let mut command = Command::new(binaries::python());
-    command.arg(program("with_roslibpy.py"));
+    command.arg(program(name));
     command
 }
 
-fn roslib() -> Command {
+pub fn roslib(name: &str) -> Command {
     let mut command = Command::new("node");
-    command.arg(program("with_roslib.cjs"));
+    command.arg(program(name));
     command.env("NODE_PATH", binaries::node_modules());
     command
 }
 
-fn roslibrust() -> Command {
+pub fn roslibrust() -> Command {
     Command::new(binaries::path("robot-with-roslibrust"))
 }
 
@@ -74,13 +78,18 @@ fn program(name: &str) -> PathBuf {
 fn finds_nothing_missing(command: Command, robot: &str) -> Verdict {
     let daemon = world().with(FIXTURE)?;
     let path = format!("{}?robot={robot}", FIXTURE.name);
-    does_all(&daemon, command, robot, &path)
+    does_all(&daemon, command, (FIXTURE, robot), &[daemon.url(&path)])
 }
 
-/// Runs a client's program; when it asks for it, ends the robot's servant.
-fn does_all(daemon: &Daemon, mut command: Command, robot: &str, path: &str) -> Verdict {
+/// Runs a client's program with these words; when it asks for it, ends the robot's servant.
+pub fn does_all(
+    daemon: &Daemon,
+    mut command: Command,
+    (service, robot): (Service, &str),
+    words: &[String],
+) -> Verdict {
     let mut child = command
-        .arg(daemon.url(path))
+        .args(words)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .spawn()
@@ -89,7 +98,7 @@ fn does_all(daemon: &Daemon, mut command: Command, robot: &str, path: &str) -> V
     for line in BufReader::new(child.stdout.take().context("piped")?).lines() {
         let line = line?;
         if line == "end my servant" {
-            let servant = daemon.servant_of(FIXTURE.name, robot)?;
+            let servant = daemon.servant_of(service.name, robot)?;
             let id = servant["id"].as_str().context("an id")?;
             daemon.deployer().types(&["stop", id])?.succeeded()?;
         }

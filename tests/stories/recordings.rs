@@ -16,8 +16,8 @@ use support::world::world;
 use crate::access::token;
 use crate::inside::Scene;
 
-/// What the format's own Python package finds in a file.
-fn reads(file: &Path) -> anyhow::Result<Value> {
+/// What the format's own Python packages find in a file.
+pub fn reads(file: &Path) -> anyhow::Result<Value> {
     let said = with_python("read", file)?;
     Ok(serde_json::from_str(&said)?)
 }
@@ -69,7 +69,8 @@ impl Drop for Talker {
     }
 }
 
-fn texts(file: &Value, topic: &str) -> anyhow::Result<Vec<String>> {
+/// Those of a topic of strings in a file that was read.
+pub fn texts(file: &Value, topic: &str) -> anyhow::Result<Vec<String>> {
     Ok(serde_json::from_value(file["texts"][topic].clone())?)
 }
 

@@ -29,26 +29,25 @@ fn offers(url: &str, protocol: &str) -> Result<Robot, Refusal> {
     Robot::try_connect_offering(url, &[protocol]).map(|(viewer, _)| viewer)
 }
 
-/// Foxglove's own client does all that it can.
-fn foxglove(scene: &Scene, token: &str, part: &str) -> anyhow::Result<String> {
-    let program = binaries::checkout().join("tests/robots/with_foxglove.cjs");
+/// A program with Foxglove's own client does all that it can.
+pub fn foxglove(program: &str, url: &str, part: &str) -> Verdict {
     let mut client = Command::new("node");
     client
-        .arg(program)
-        .arg(address(scene, token))
-        .arg(part)
+        .arg(binaries::checkout().join("tests/robots").join(program))
+        .args([url, part])
         .env("NODE_PATH", binaries::node_modules());
     let said = run(&mut client)?.succeeded()?.stdout;
     ensure!(said.ends_with("done\n"), "{said}");
-    Ok(said)
+    Ok(())
 }
 
 pub fn foxgloves_client_hears_and_an_operators_acts() -> Verdict {
     let mut scene = Scene::new("viewers", "")?;
     let olga = token(&scene.daemon, &["olga", "--role", "operator"])?;
-    foxglove(&scene, &olga, "acts")?;
+    let program = "with_foxglove.cjs";
+    foxglove(program, &address(&scene, &olga), "acts")?;
     let eve = scene.viewer("eve", "sights*")?;
-    foxglove(&scene, &eve, "looks")?;
+    foxglove(program, &address(&scene, &eve), "looks")?;
     scene.audited("olga", "looks inside")?;
     scene.audited("olga", "inside: publish:/sights/say")?;
     scene.audited("eve", "was refused publish:/sights/say")?;
