@@ -1,5 +1,6 @@
 """A robot's application of ROS 2 that knows nothing of us: rclpy as it is, over Fast DDS. It shows pictures to /people_detect, hears what was
-found, looks at the graph and at the node's parameters, and prints what came out as one line of JSON."""
+found, looks at the graph and at the node's parameters, and prints what came out as one line of JSON. One subscription asks for more than the
+node offers; all stay until standard input ends."""
 
 import json
 import sys
@@ -10,7 +11,7 @@ from geometry_msgs.msg import PolygonStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
 NODE = "people_detect"
@@ -39,6 +40,8 @@ def result(future):
 
 
 node.create_subscription(PolygonStamped, "/people_detect/found", hear, 10)
+kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+node.create_subscription(PolygonStamped, "/people_detect/found", lambda found: sys.exit("it was not offered"), kept)
 pictures = node.create_publisher(Image, "/image", qos_profile_sensor_data)
 until("the node", lambda: pictures.get_subscription_count() == 1 and node.count_publishers("/people_detect/found") == 1)
 
@@ -70,6 +73,7 @@ print(json.dumps({
     "publishes": dict(node.get_publisher_names_and_types_by_node(NODE, "/")),
     "subscribes": dict(node.get_subscriber_names_and_types_by_node(NODE, "/")),
     "reliable": [str(info.qos_profile.reliability.name) for info in node.get_subscriptions_info_by_topic("/image")],
-}))
+}), flush=True)
+sys.stdin.read()
 node.destroy_node()
 rclpy.shutdown()

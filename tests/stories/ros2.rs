@@ -1,7 +1,8 @@
 //! Packages of ROS 2, by rosbridge and by stubs. What a robot sees of a stub when the link is bad is told in [`crate::failover`] and
 //! [`crate::fallback`], for both ROSes.
 
-use std::process::Command;
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,7 +17,6 @@ use ros::bus::{
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
 use support::cable::{Badness, Cable};
-use support::deployer::run;
 use support::layout::Layout;
 use support::people::{self, Camera};
 use support::robot::PATIENCE;
@@ -272,8 +272,30 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     let mut command = Command::new(binaries::ros2().join("bin/python"));
     command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
     site.system.is_of(&mut command);
-    let told = with_log(run(&mut command)?.succeeded(), &stub)?;
-    let told: Value = serde_json::from_str(&told.stdout).context(told.stdout.clone())?;
+    command.stdin(Stdio::piped()).stdout(Stdio::piped());
+    let mut application = command.spawn()?;
+    let mut told = String::new();
+    BufReader::new(application.stdout.as_mut().context("piped")?).read_line(&mut told)?;
+    let explained = support::until("whom the stub cannot reach", || {
+        let told = daemon.get_json("/api/v1/robots/ros2-rclpy/explain")?;
+        let causes = told["causes"].to_string();
+        Ok(causes
+            .contains("between /application and /people_detect")
+            .then_some(causes.clone())
+            .ok_or(causes))
+    });
+    let ended = application.wait_with_output()?;
+    let told = with_log(
+        serde_json::from_str::<Value>(&told).with_context(|| format!("{told}{}", ended.status)),
+        &stub,
+    )?;
+    let explained = explained?;
+    ensure!(
+        explained.contains(
+            "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: reliable, volatile; subscriber: reliable, transient_local)"
+        ),
+        "{explained}"
+    );
     for number in 1..=3 {
         let left = f64::from(5 * number);
         let corners = json!([[left, 10.0], [left + 7.0, 19.0]]);

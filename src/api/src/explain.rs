@@ -127,6 +127,9 @@ pub struct Link {
     /// Services that the node has looked for in vain.
     #[serde(default)]
     pub unserved: Vec<String>,
+    /// Nodes of the robot with which no messages of the node pass, and why: a sentence each.
+    #[serde(default)]
+    pub refused: Vec<String>,
     /// Other machines that are connected as the same robot.
     #[serde(default, alias = "twins")]
     pub duplicates: Vec<String>,

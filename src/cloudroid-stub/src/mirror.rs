@@ -17,6 +17,7 @@ mod lent;
 mod outputs;
 mod parameters;
 pub mod promise;
+mod refusals;
 mod reports;
 mod safe_stop;
 mod stand_in;
@@ -41,6 +42,7 @@ use lent::LentServices;
 use outputs::Outputs;
 use parameters::Parameters;
 use promise::Promise;
+use refusals::Refusals;
 
 /// How long a node of a new session may take to register what it had before.
 const SETTLE: Duration = Duration::from_secs(3);
@@ -60,6 +62,8 @@ pub struct Mirror {
     parameters: Parameters,
     /// Messages dropped on this side, but for the session's own.
     drops: Drops,
+    /// With whom no messages pass.
+    refusals: Arc<Refusals>,
     promise: OnceLock<Promise>,
     /// How long a call of a robot's service may take.
     call_limit: Duration,
@@ -93,6 +97,7 @@ impl Mirror {
             lent: LentServices::default(),
             parameters: Parameters::default(),
             drops: Drops::default(),
+            refusals: Arc::default(),
             promise: OnceLock::new(),
             call_limit,
             applied: tokio::sync::Mutex::default(),
@@ -104,6 +109,7 @@ impl Mirror {
         tokio::spawn(obey(Arc::downgrade(&mirror), taken));
         tokio::spawn(lent::follow(Arc::downgrade(&mirror)));
         tokio::spawn(dropped::report(Arc::downgrade(&mirror)));
+        tokio::spawn(refusals::report(Arc::downgrade(&mirror)));
         mirror
     }
 

@@ -183,6 +183,8 @@ pub enum FromRobot {
     },
     /// What was decided about the local original, for the cloud's events, oldest first.
     Decided(Vec<Decision>),
+    /// All ends on the robot with which no messages pass now.
+    Refused(Vec<Refused>),
 }
 
 /// What the cloud tells a robot.
@@ -282,6 +284,23 @@ pub struct Decision {
     pub text: String,
     /// So many seconds before it was told: while the link is down it waits.
     pub ago: f64,
+}
+
+/// An end of a topic on the robot with which no messages pass, since one of both asks for what the other does not offer.
+#[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Refused {
+    /// The topic.
+    pub topic: String,
+    /// Whose end it is.
+    pub node: String,
+    /// In what both differ, and what both say.
+    pub why: String,
+}
+
+impl Refused {
+    /// Told at most.
+    pub const MOST: usize = 64;
 }
 
 /// How the node ended.

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use api::Event;
 use api::explain::{Explanation, Link, Part, Served, dominant};
-use link::control::Request;
+use link::control::{Refused, Request};
 use reach::links::LinkStatus;
 
 use crate::errors::Error;
@@ -100,6 +100,14 @@ fn link(status: LinkStatus) -> Link {
     let drops = here
         .chain(there.map(|drop| format!("on the robot {drop}")))
         .collect();
+    let refused = status.refused.iter().map(|one| {
+        let Refused { topic, node, why } = one;
+        format!(
+            "no messages of {topic} pass between {node} and {}: {why}",
+            status.node
+        )
+    });
+    let refused = refused.collect();
     Link {
         up: status.up,
         round_trip: status.round_trip,
@@ -129,6 +137,7 @@ fn link(status: LinkStatus) -> Link {
         left_out: status.left_out,
         unfed: status.unfed,
         unserved: status.unserved,
+        refused,
         duplicates: status.duplicates,
         node: status.node,
     }

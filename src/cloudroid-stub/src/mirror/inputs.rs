@@ -227,10 +227,13 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
             return;
         }
     };
-    if let Some(mirror) = mirror.upgrade() {
+    let Some(refused) = mirror.upgrade().map(|mirror| {
         let dropped = Arc::clone(&subscription.dropped);
         mirror.drops.watch(&wanted.topic, Cause::Busy, dropped);
-    }
+        mirror.refusals.end(&wanted.topic)
+    }) else {
+        return;
+    };
     let topic: Arc<str> = wanted.topic.as_str().into();
     let mut present = subscription.matched.clone();
     // Who is there already is no change.
@@ -266,7 +269,9 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
                 if change.is_err() {
                     return;
                 }
-                changed = Some(present.borrow_and_update().clone());
+                let now = present.borrow_and_update().clone();
+                refused.meets(&now);
+                changed = Some(now);
                 continue;
             }
         };

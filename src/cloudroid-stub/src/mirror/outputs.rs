@@ -147,12 +147,18 @@ impl Outputs {
 fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
     let (mirror, of) = (Arc::downgrade(mirror), Arc::downgrade(topic));
     let mut subscribers = topic.publisher().matched();
+    let refused = mirror
+        .upgrade()
+        .map(|mirror| mirror.refusals.end(&topic.name));
     // Not the topic itself: it is taken back when nobody but this task would hold it.
     let news = Arc::clone(&topic.news);
     let task = tokio::spawn(async move {
         let mut told = None;
         loop {
             let matched = subscribers.borrow_and_update().clone();
+            if let Some(end) = &refused {
+                end.meets(&matched);
+            }
             {
                 let (Some(mirror), Some(topic)) = (mirror.upgrade(), of.upgrade()) else {
                     return;

@@ -202,6 +202,14 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             format!("start what serves it on the robot, or remap it: {service}:=/THE/SERVICE"),
         );
     }
+    for refused in &link.refused {
+        say(
+            Weight::Hint,
+            refused.clone(),
+            "have the subscriber ask for no more than the publisher offers (ros2 topic info -v shows both)"
+                .to_owned(),
+        );
+    }
     if let Some(clock) = link.clock.filter(|clock| clock.abs() > CLOCK_APART) {
         let side = if clock > 0.0 { "ahead of" } else { "behind" };
         say(

@@ -19,7 +19,7 @@ use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror, seen};
 use crate::Flow;
 use link::clock::Sample;
-use link::control::{FromCloud, FromRobot, Hello, Request, Sla};
+use link::control::{FromCloud, FromRobot, Hello, Refused, Request, Sla};
 use link::drops::{Drop, Drops, Reporter};
 use link::record::Record;
 use link::session::{CloudSession, Handler, SessionOptions};
@@ -62,6 +62,8 @@ pub(super) struct NodeLink {
     pub(super) drops: Drops,
     /// On the robot's side, as it told.
     dropped: Mutex<Vec<Drop>>,
+    /// With whom no messages pass there, as it told.
+    refused: Mutex<Vec<Refused>>,
     /// What must wait for an output to be subscribed to.
     pub(super) held: Held,
     orders: mpsc::UnboundedSender<(FromRobot, Option<Hold>)>,
@@ -108,6 +110,7 @@ impl NodeLink {
             drops: Drops::default(),
             held: Held::default(),
             dropped: Mutex::default(),
+            refused: Mutex::default(),
             orders,
             signals,
             tasks: Mutex::default(),
@@ -166,6 +169,7 @@ impl NodeLink {
         let (given, left_out) = self.outputs.left_out();
         // Before the expression below, to whose end they would stay locked: `duplicates` looks at other links.
         let dropped = self.dropped.lock().clone();
+        let refused = self.refused.lock().clone();
         let requests = self.requests.lock().iter().cloned().collect();
         LinkStatus {
             node: self.node.clone(),
@@ -185,6 +189,7 @@ impl NodeLink {
             left_out,
             unfed: self.unfed(),
             unserved: self.unserved(),
+            refused,
             duplicates: self.duplicates(),
         }
     }
@@ -429,6 +434,10 @@ async fn obey(
                 }
             }
             FromRobot::Dropped(dropped) => *link.dropped.lock() = dropped,
+            FromRobot::Refused(mut refused) => {
+                refused.truncate(Refused::MOST);
+                *link.refused.lock() = refused;
+            }
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
         }
     }

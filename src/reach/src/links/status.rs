@@ -1,6 +1,6 @@
 //! How a link is doing.
 
-use link::control::{Request, Sla};
+use link::control::{Refused, Request, Sla};
 use link::drops::Drop;
 
 /// How a link is doing, for whoever explains.
@@ -34,6 +34,8 @@ pub struct LinkStatus {
     pub unfed: Vec<String>,
     /// Services that the node has looked for in vain, and that are not known to be there now.
     pub unserved: Vec<String>,
+    /// Ends on the robot with which no messages pass, as its stub reported.
+    pub refused: Vec<Refused>,
     /// Other machines that are connected as the same robot.
     pub duplicates: Vec<String>,
 }

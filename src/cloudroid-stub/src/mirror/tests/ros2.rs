@@ -50,6 +50,45 @@ async fn ends_have_the_quality_of_service_of_the_node() {
     .await;
 }
 
+#[tokio::test]
+async fn the_cloud_is_told_with_whom_no_messages_pass() {
+    let scene = Scene::new(RosVersion::Two, "/node").await;
+    let string = || string_type(RosVersion::Two);
+    let qos = Qos::keep_last(5);
+    let _state = scene.real.advertise("/state", string(), qos).await;
+    let _command = scene.real.subscribe("/command", string(), qos).await;
+    let _link = scene.links().await;
+    let app = scene.robot.node("/app").await;
+    let other = || WireType {
+        name: "std_msgs/msg/Int32".to_owned(),
+        ..string()
+    };
+    let state = app.subscribe("/state", other(), qos).await.unwrap();
+    let command = app.advertise("/command", other(), qos).await.unwrap();
+    let told = async |expected: &[&str]| {
+        let refused = || scene.hub.status().remove(0).refused;
+        let topics = || -> Vec<String> { refused().into_iter().map(|one| one.topic).collect() };
+        let looked = async {
+            while topics() != expected {
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        let came = timeout(SOON, looked).await;
+        assert!(came.is_ok(), "not {expected:?}: {:?}", refused());
+        refused()
+    };
+    let refused = told(&["/command", "/state"]).await;
+    assert_eq!(refused[1].node, "/app");
+    assert!(
+        refused[1].why.contains("its type is std_msgs/msg/Int32"),
+        "{refused:?}"
+    );
+    drop(command);
+    told(&["/state"]).await;
+    drop(state);
+    told(&[]).await;
+}
+
 /// Passes goals on, to be ended.
 struct Goals(mpsc::UnboundedSender<(String, Bytes)>);
 

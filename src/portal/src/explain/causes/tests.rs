@@ -104,6 +104,7 @@ fn each_thing_that_can_be_wrong_is_named() {
         clock: Some(-2000.0),
         unfed: vec!["/image".into()],
         unserved: vec!["/static_map".into()],
+        refused: vec!["no messages of /seen pass between /view and /detect: why".into()],
         unsent: 12,
         given: 128,
         left_out: 40,
@@ -141,6 +142,7 @@ fn each_thing_that_can_be_wrong_is_named() {
         "waits for memory 30 %",
         "1 processes of s1 were killed",
         "3 messages of s1 were dropped",
+        "no messages of /seen pass between /view and /detect: why; have the subscriber ask for no more",
         "2000 ms behind the server's",
         "requests queue before /detect: 60 ms of 100 ms, while it needs 30 ms for one; lower the rate of its inputs, or give it more cores: cloudroidctl set s1 --cpus N",
         "12 inputs of /detect were not sent in the last minute",
@@ -247,12 +249,21 @@ fn a_links_requests_are_summed_up() {
         left_out: 1,
         unfed: vec![],
         unserved: vec![],
+        refused: vec![link::control::Refused {
+            topic: "/seen".into(),
+            node: "/view".into(),
+            why: "durability".into(),
+        }],
         duplicates: vec![],
     });
     assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
     assert_eq!(seen.dropped, 32);
     assert!(seen.drops[0].starts_with("in the cloud 2 messages of /image were dropped: "));
     assert!(seen.drops[1].starts_with("on the robot 30 messages of /image were dropped: "));
+    assert_eq!(
+        seen.refused,
+        ["no messages of /seen pass between /view and /detect: durability"]
+    );
     assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
     let total = seen.phases.last().expect("parts");
     assert_eq!(
@@ -291,6 +302,7 @@ fn what_was_never_promised_is_not_late() {
         left_out: 0,
         unfed: vec![],
         unserved: vec![],
+        refused: vec![],
         duplicates: vec![],
     });
     assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
