@@ -112,7 +112,7 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     assert_eq!(channel["schemaEncoding"], "ros2msg");
     let schema = channel["schema"].as_str().expect("a text");
     assert!(schema.starts_with("Where[] at\n"), "{schema}");
-    assert!(schema.contains("MSG: lab/msg/Where\nfloat64 x"), "{schema}");
+    assert!(schema.contains("MSG: lab/Where\nfloat64 x"), "{schema}");
 
     let id = channel["id"].clone();
     let wanted = json!({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": id}]});

@@ -1,6 +1,5 @@
 //! What the graph of nodes, topics and services says.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -8,11 +7,11 @@ use access::Grants;
 use futures_util::StreamExt;
 use futures_util::stream;
 use ros::bus::{Graph, RosVersion, TopicNodes};
-use ros::schema::{MessageType, Registry};
+use ros::schema::Registry;
 use serde_json::{Value, json};
 
 use super::{NODE, Service, with_own};
-use crate::names::{is_same_type, plain_type};
+use crate::names::is_same_type;
 use crate::shared::Shared;
 use crate::{presence, tf};
 
@@ -137,24 +136,12 @@ pub(super) fn topics_and_raw_types(
         let found = with_own(version, registry, |registry| {
             registry.message(type_of(nodes))
         });
-        found.map(|found| raw_text(&found)).unwrap_or_default()
+        found
+            .map(|found| found.full_text().to_owned())
+            .unwrap_or_default()
     });
     answer["typedefs_full_text"] = texts.collect::<Vec<_>>().into();
     answer
-}
-
-/// A definition with all that it contains, whose names are written `package/Type` in either ROS.
-fn raw_text(message: &MessageType) -> String {
-    let text = message.full_text();
-    if message.version() == RosVersion::One {
-        return text.to_owned();
-    }
-    let lines = text.split_inclusive('\n');
-    let lines = lines.map(|line| match line.strip_prefix("MSG: ") {
-        Some(name) => Cow::Owned(format!("MSG: {}", plain_type(name))),
-        None => Cow::Borrowed(line),
-    });
-    lines.collect()
 }
 
 pub(super) fn topic_type(graph: &Graph, topic: &str) -> Value {

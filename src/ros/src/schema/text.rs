@@ -51,7 +51,8 @@ fn append_dependencies<'a>(
         out.push('\n');
         out.extend(std::iter::repeat_n('=', RULE));
         out.push_str("\nMSG: ");
-        out.push_str(dependency.name());
+        // In ROS 2, too, without what is between package and type: readers of such texts (Foxglove's) look for what fields say.
+        out.push_str(&dependency.name().replacen("/msg/", "/", 1));
         out.push('\n');
         out.push_str(dependency.text());
         append_dependencies(dependency, seen, out);
