@@ -34,6 +34,8 @@ mod calls;
 mod candidates;
 #[path = "stories/clients.rs"]
 mod clients;
+#[path = "stories/clients_of_ros2.rs"]
+mod clients_of_ros2;
 #[path = "stories/commands.rs"]
 mod commands;
 #[path = "stories/cross.rs"]
@@ -290,6 +292,7 @@ fn main() -> ExitCode {
             roslibrust_finds_nothing_missing,
             clients_with_tokens_find_nothing_missing,
         ],
+        stories![clients_of_ros2: they_find_nothing_missing],
         stories![house:
             a_second_daemon_on_the_same_home_is_refused,
             the_state_is_closed_to_others,

@@ -1,7 +1,9 @@
 //! All that a robot does, with roslibrust against rosbridge_fixture. Prints `end my servant` and expects to be connected to
-//! a new one; ends with `done`.
+//! a new one; ends with `done`. Of ROS 2 all that it does against the herald.
 //!
-//! usage: robot-with-roslibrust URL
+//! usage: robot-with-roslibrust URL [ros2]
+
+mod ros2;
 
 use std::time::Duration;
 
@@ -61,6 +63,8 @@ service!(GetTime, "rosapi/GetTime", Nothing, Now);
 service!(SetParam, "rosapi/SetParam", Entry, Nothing);
 service!(GetParam, "rosapi/GetParam", Key, Value);
 
+pub(crate) use {message, service};
+
 fn check(what: &str, truth: bool) -> Result<()> {
     ensure!(truth, "{what}: not so");
     println!("{what}");
@@ -72,6 +76,10 @@ async fn main() -> Result<()> {
     let url = std::env::args().nth(1).context("a URL")?;
     let options = ClientHandleOptions::new(url).timeout(PATIENCE);
     let ros = ClientHandle::new_with_options(options.clone()).await?;
+    if std::env::args().nth(2).is_some_and(|word| word == "ros2") {
+        let other = ClientHandle::new_with_options(options).await?;
+        return ros2::does_all(ros, other).await;
+    }
 
     let talk = ros.advertise::<Text>("/talk").await?;
     let said = ros.subscribe::<Text>("/talk").await?;
