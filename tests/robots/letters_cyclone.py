@@ -90,6 +90,9 @@ class Hears(Listener):
         self.take = take
 
     def on_data_available(self, reader):
+        # None while it is being made.
+        if reader is None:
+            return
         for sample in reader.take(10):
             # Whoever leaves is told, too, by a sample without data.
             if sample.sample_info.valid_data:
@@ -116,7 +119,11 @@ class Application:
         return DataWriter(self.participant, Topic(self.participant, name, of), qos=qos)
 
     def reader(self, name, of, take, qos=VOLATILE):
-        return DataReader(self.participant, Topic(self.participant, name, of), qos=qos, listener=Hears(take))
+        hears = Hears(take)
+        made = DataReader(self.participant, Topic(self.participant, name, of), qos=qos, listener=hears)
+        # What came meanwhile.
+        hears.on_data_available(made)
+        return made
 
     def permit(self, request):
         message = "as it likes" if request.data else "never"
@@ -154,7 +161,7 @@ class Application:
         return self.answers.get(timeout=LONGEST)
 
     def nodes(self):
-        return sorted(node for nodes in self.of_nodes.values() for node in nodes)
+        return sorted(node for nodes in list(self.of_nodes.values()) for node in nodes)
 
 
 application = Application()
