@@ -84,6 +84,16 @@ struct Action {
     goals: HashMap<String, (u128, Arc<dyn GoalEvents>)>,
 }
 
+/// In the words of the real bus.
+fn profile(qos: &Qos) -> &'static str {
+    match (qos.reliability, qos.is_latching()) {
+        (Reliability::Reliable, false) => "reliable, volatile",
+        (Reliability::Reliable, true) => "reliable, transient_local",
+        (Reliability::BestEffort, false) => "best_effort, volatile",
+        (Reliability::BestEffort, true) => "best_effort, transient_local",
+    }
+}
+
 impl Publication {
     /// What a node publishes itself is not brought back to it.
     fn is_beside(&self, listener: &Listener) -> bool {
@@ -100,8 +110,11 @@ impl Publication {
         let demanded = listener.demanded.filter(Qos::is_latching)?;
         let offers_less = demanded.durability != self.qos.durability;
         offers_less.then(|| {
-            "durability: the publisher offers volatile, the subscriber asks for transient_local"
-                .to_owned()
+            format!(
+                "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: {}; subscriber: {})",
+                profile(&self.qos),
+                profile(&demanded)
+            )
         })
     }
 

@@ -14,6 +14,8 @@
 #![forbid(unsafe_code)]
 
 pub mod components;
+#[cfg(test)]
+mod doubles;
 pub mod egress;
 mod endings;
 mod ends;

@@ -164,3 +164,6 @@ impl Followed {
         });
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -23,7 +23,7 @@ async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "a", "level": "error", "msg":
-            "advertise: topic /map: nothing passes between /mapper and this client: durability: the publisher offers volatile, the subscriber asks for transient_local"})
+            "advertise: topic /map: nothing passes between /mapper and this client: durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: reliable, volatile; subscriber: reliable, transient_local)"})
     );
     client.settled().await;
     // It is no reason to wait for it either.

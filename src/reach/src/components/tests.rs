@@ -1,66 +1,12 @@
-use std::time::SystemTime;
-
-use async_trait::async_trait;
-use link::control::{Exit, Node, Request};
-use parking_lot::Mutex;
-use ros::bus::ParamValue;
-use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::*;
-use crate::Linked;
+use crate::doubles::{Events, Started};
 use crate::memory_bus::MemorySystem;
 use crate::memory_container::{MemoryContainer, registry};
 
 /// Only bounds how long a failing test takes.
 const LONG: Duration = Duration::from_secs(60);
-
-/// The nodes that stubs have started, and nothing else.
-#[derive(Default)]
-struct Started(Vec<Linked>);
-
-#[async_trait]
-impl Nodes for Started {
-    async fn start(&self, _node: &Node, _run: &str) -> Result<(), String> {
-        Ok(())
-    }
-    async fn signal(&self, _node: &str, _signal: i32) -> Result<(), String> {
-        Ok(())
-    }
-    async fn ended(&self, _node: &str) -> Exit {
-        Exit::default()
-    }
-    async fn is_running(&self, _node: &str) -> bool {
-        false
-    }
-    async fn running(&self) -> Vec<Linked> {
-        self.0.clone()
-    }
-    fn parameters(&self, _node: &Node) -> Vec<(String, ParamValue)> {
-        Vec::new()
-    }
-    fn translate(&self, _node: &Node, text: &str) -> String {
-        text.to_owned()
-    }
-    fn lines(&self, _node: &str) -> mpsc::Receiver<(bool, String)> {
-        mpsc::channel(1).1
-    }
-    fn warn(&self, _kind: &str, _text: &str) {}
-}
-
-#[derive(Default)]
-struct Events(Mutex<Vec<(String, String)>>);
-
-impl Observer for Events {
-    fn fits(&self, _made_of: Option<u64>, _image: &str) -> Result<(), String> {
-        Ok(())
-    }
-    fn event(&self, _level: api::Level, kind: &str, message: &str, _robot: Option<&str>) {
-        self.0.lock().push((kind.to_owned(), message.to_owned()));
-    }
-    fn served_locally(&self, _robot: &str, _node: &str, _at: SystemTime, _why: Option<&str>) {}
-    fn measured(&self, _request: &Request) {}
-}
 
 /// A servant whose revision loads something into `/box`.
 struct World {
@@ -157,15 +103,7 @@ async fn a_container_that_serves_nothing_is_told_with_how_long_was_waited() {
 
 #[tokio::test]
 async fn a_container_that_a_stub_has_started_is_left_to_the_robot() {
-    let node = Node {
-        name: "/box".to_owned(),
-        ..Node::default()
-    };
-    let linked = Linked {
-        node,
-        given: Vec::new(),
-    };
-    let world = World::new(&["talk::Talker"], Started(vec![linked]), LONG);
+    let world = World::new(&["talk::Talker"], Started::node("/box"), LONG);
     let container = MemoryContainer::start(&world.system, "/box").await;
     // Whoever follows has seen the container when it has seen what came later, and its task has run by then: one thread.
     for _ in 0..100 {
