@@ -274,6 +274,12 @@ async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
         }
     };
     assert_eq!(timeout(LONG, confirmed).await.unwrap(), lookup());
+    // The same from another server of the robot: calls go there.
+    robot.has(Some(9));
+    let call = calls(&servant, "again");
+    let id = robot.is_called(9, "again").await;
+    robot.session.answer(id, now(), Ok("and again".into()));
+    assert_eq!(call.await.unwrap().unwrap(), "and again");
     // Taken back, it is looked for again.
     robot.has(None);
     let gone = loop {

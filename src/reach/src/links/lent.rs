@@ -151,21 +151,36 @@ impl NodeLink {
             let Some(known) = names.get_mut(&service) else {
                 return;
             };
-            if let (State::There { there, .. }, Some(served)) = (&*known, &of) {
-                if there.is(served) {
-                    return;
+            let before = match &*known {
+                State::There { there, .. } => Some(Arc::clone(there)),
+                _ => None,
+            };
+            let after = match of {
+                Some(served) if before.as_ref().is_some_and(|before| before.is(&served)) => return,
+                Some(served) => Some(there(&hub, self, served)),
+                None => None,
+            };
+            // To nodes the same type is the service that they are connected to, whoever serves it by whatever number: were it taken back for
+            // a moment, what they ask in that moment would never be answered.
+            let stays = |before: &There, after: &There| before.service_type == after.service_type;
+            let after = match (before, after) {
+                (Some(before), Some(after)) if stays(&before, &after) => Some(There {
+                    gone: before.gone.clone(),
+                    ..after
+                }),
+                (Some(before), after) => {
+                    before.gone.send_replace(true);
+                    after
                 }
-            }
-            let state = match of {
-                Some(served) => State::There {
-                    there: Arc::new(there(&hub, self, served)),
+                (None, after) => after,
+            };
+            *known = match after {
+                Some(there) => State::There {
+                    there: Arc::new(there),
                     asked: now,
                 },
                 None => State::NotThere { since: now },
             };
-            if let State::There { there, .. } = std::mem::replace(known, state) {
-                there.gone.send_replace(true);
-            }
         }
         self.lent.told.send_modify(|told| *told += 1);
     }
