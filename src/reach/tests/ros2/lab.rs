@@ -151,17 +151,31 @@ pub struct Peer {
 impl Peer {
     /// Waits until it says something of this kind, and gives the rest of it.
     pub async fn says(&mut self, kind: &str) -> Vec<Value> {
-        let said = async {
+        let [said] = self.says_each([kind]).await;
+        said
+    }
+
+    /// The same of several kinds, in whichever order it says them: of each the first.
+    pub async fn says_each<const N: usize>(&mut self, kinds: [&str; N]) -> [Vec<Value>; N] {
+        let mut said = [const { Vec::new() }; N];
+        let mut missing = N;
+        let all = async {
             while let Some(line) = self.lines.next_line().await.expect("its output") {
                 let mut words: Vec<Value> = serde_json::from_str(&line).expect("JSON");
-                if words.first().is_some_and(|first| first == kind) {
-                    return words.split_off(1);
+                let of = |kind: &&str| words.first().is_some_and(|first| first == kind);
+                if let Some(at) = kinds.iter().position(of).filter(|at| said[*at].is_empty()) {
+                    said[at] = words.split_off(0);
+                    missing -= 1;
+                }
+                if missing == 0 {
+                    return;
                 }
             }
             panic!("the node has ended");
         };
-        let said = timeout(LONG, said).await;
-        said.unwrap_or_else(|_| panic!("it should say {kind}"))
+        let come = timeout(LONG, all).await;
+        come.unwrap_or_else(|_| panic!("it should say each of {kinds:?}"));
+        said.map(|mut words| words.split_off(1))
     }
 
     /// Tells it to do something, and waits until it says that it has.
