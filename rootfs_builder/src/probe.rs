@@ -36,6 +36,8 @@ use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::time::Instant;
 
+pub use settle::still;
+
 use feed::Feed;
 
 /// Messages of an output that are kept between two looks.

@@ -84,6 +84,27 @@ pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
     robot.leaves()
 }
 
+pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict {
+    let daemon = world().shared()?;
+    let arguments = ["--name", "duets", "--node", "duet", "--node", "duet"];
+    daemon
+        .deployer()
+        .pushes("duet_ros2", &arguments)?
+        .succeeded()?;
+    let service = daemon.get_json("/api/v1/services/duets")?;
+    let topics = service["interface"]["topics"].as_array();
+    let topics = topics.context("a list")?.iter();
+    let mut topics: Vec<&str> = topics.filter_map(|one| one["name"].as_str()).collect();
+    topics.sort();
+    let songs = ["/alto/song", "/alto_2/song", "/tenor/song", "/tenor_2/song"];
+    ensure!(topics == songs, "{service:#}");
+    let mut robot = daemon.robot("duets?robot=listener")?;
+    robot.subscribes("/tenor_2/song")?;
+    let heard = robot.hears_on("/tenor_2/song")?;
+    ensure!(heard["data"] == "tenor_2", "{heard}");
+    Ok(())
+}
+
 /// The definition of the herald's action.
 fn count() -> anyhow::Result<Arc<ActionDef>> {
     let registry = Registry::of(RosVersion::Two);

@@ -119,7 +119,7 @@ pub(super) async fn answered<T>(
 ///
 /// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to. A node
 /// that waits for a core is, too: all times are the nodes' own, but for `patience`.
-pub(super) async fn still(
+pub async fn still(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
 ) -> Result<bool, ProbeError> {

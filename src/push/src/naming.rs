@@ -12,7 +12,7 @@ use api::PushOptions;
 use package::interface::Interface;
 use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
-use rootfs_builder::probe::ProbeError;
+use rootfs_builder::probe::{ProbeError, ProbeOptions, still};
 use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use ros::plumbing;
@@ -28,7 +28,8 @@ use crate::Error;
 use store::Plan;
 
 /// A program may be several nodes (ROS 2), which come one after the other: its first by name is the one that it is called by. What is taken already
-/// gets a number, as every node of a second such program does. For so long others are waited for after one, and after the first.
+/// gets a number, as every node of a second such program does. Others are waited for until none has come for so long after one, and at most for so long:
+/// of the nodes' own time, which stands still while they wait for a core.
 const QUIET: Duration = Duration::from_millis(200);
 const MORE_NODES: Duration = Duration::from_secs(2);
 
@@ -103,52 +104,59 @@ async fn look(
         .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
     let mut graph = looked.bus.graph();
     let seen = graph.clone();
-    let patience = pusher.options.probe;
+    let options = ProbeOptions {
+        ros,
+        patience: pusher.options.probe,
+        settle: QUIET,
+        restless: MORE_NODES,
+        work: Some(probe::work(servant)),
+        ..ProbeOptions::new(
+            alone.nodes.iter().map(|node| node.name.clone()).collect(),
+            NODE,
+        )
+    };
     let all_there = |graph: &Arc<Graph>| names(graph, unnamed, host).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
         // What it says of itself is told when it is started again, with its parameters.
-        _ = probe::ended(servant, alone) => Ok(names(&seen.borrow(), unnamed, host)),
-        there = timeout(patience, registered(&mut graph, all_there)) => match there {
-            Ok(true) => Ok(names(&seen.borrow(), unnamed, host)),
-            Ok(false) => Err(failed(ProbeError::MasterGone.to_string())),
+        _ = probe::ended(servant, alone) => Ok(()),
+        registered = registered(&mut graph, all_there, &options) => match registered {
             // Here it cannot reach what it was granted; it can when it is looked at.
-            Err(_) if !alone.grants.egress.is_empty() => Ok(names(&seen.borrow(), unnamed, host)),
-            Err(_) => Err(never_registered(alone, patience)),
+            Err(ProbeError::NeverRegistered { .. }) if !alone.grants.egress.is_empty() => Ok(()),
+            registered => registered,
         },
     };
+    let found = names(&seen.borrow(), unnamed, host);
     looked.bus.close().await;
     match registered {
-        Ok(names) => Ok(names),
-        Err(error) => Err(probe::explained(error, servant).await),
+        Ok(()) => Ok(found),
+        Err(error) => Err(probe::explained(failed(error.to_string()), servant).await),
     }
 }
 
-/// Returns when all are there and no other nodes have come for a moment; false if the graph is not told any more.
+/// Returns when all are there, and no others come.
 async fn registered(
     graph: &mut watch::Receiver<Arc<Graph>>,
     all_there: impl FnMut(&Arc<Graph>) -> bool,
-) -> bool {
-    if graph.wait_for(all_there).await.is_err() {
-        return false;
-    }
-    let settled = async { while let Ok(Ok(())) = timeout(QUIET, graph.changed()).await {} };
-    let _ = timeout(MORE_NODES, settled).await;
-    true
-}
-
-fn never_registered(alone: &Plan, after: Duration) -> Error {
-    let nodes = alone.nodes.iter().map(|node| node.name.clone()).collect();
-    Error::Failed {
-        message: ProbeError::NeverRegistered {
-            nodes,
-            after,
-            sought: Vec::new(),
+    options: &ProbeOptions,
+) -> Result<(), ProbeError> {
+    let there = timeout(options.patience, graph.wait_for(all_there)).await;
+    match there.map(|there| there.map(drop)) {
+        Ok(Ok(())) => {}
+        Ok(Err(_)) => return Err(ProbeError::MasterGone),
+        Err(_) => {
+            return Err(ProbeError::NeverRegistered {
+                nodes: options.nodes.clone(),
+                after: options.patience,
+                sought: Vec::new(),
+            });
         }
-        .to_string(),
-        next: None,
-        log: Vec::new(),
     }
+    // In ROS 1 a program is one node.
+    if options.ros == RosVersion::Two {
+        still(graph, options).await?;
+    }
+    Ok(())
 }
 
 /// Which nodes of the graph are whose: their names without namespace, or an absolute one where its program has chosen the namespace itself. `host`: the

@@ -155,7 +155,6 @@ async fn look(
     };
     let registry = Registry::of_definitions(built.flavour.ros.bus(), &built.inventory.definitions)
         .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
-    let working = Arc::clone(servant);
     let options = ProbeOptions {
         patience: pusher.options.probe,
         types: push
@@ -164,7 +163,7 @@ async fn look(
             .map(supplement::topic_types)
             .unwrap_or_default(),
         components: plan.components.clone(),
-        work: Some(Work::new(move || worked(Arc::clone(&working)))),
+        work: Some(work(servant)),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),
             NODE,
@@ -216,6 +215,12 @@ async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
         }
         other => other,
     }
+}
+
+/// What a servant's nodes have had of the processors.
+pub(super) fn work(servant: &Arc<dyn Servant>) -> Work {
+    let servant = Arc::clone(servant);
+    Work::new(move || worked(Arc::clone(&servant)))
 }
 
 async fn worked(servant: Arc<dyn Servant>) -> Option<Worked> {
