@@ -668,7 +668,8 @@ impl ActionClient for MemoryClient {
                 .goals
                 .insert(id.to_owned(), (self.number, events.clone()));
         }
-        if let Err(text) = server.goal(id, goal) {
+        let taken = server.goal(id, goal);
+        if let Err(text) = taken {
             let mut state = self.system.state.lock();
             let action = state.actions.entry(self.action.clone()).or_default();
             action.goals.remove(id);
@@ -678,6 +679,8 @@ impl ActionClient for MemoryClient {
                 text,
                 result: Bytes::new(),
             }));
+        } else {
+            events.accepted();
         }
     }
 
@@ -685,9 +688,10 @@ impl ActionClient for MemoryClient {
         let under_way = {
             let state = self.system.state.lock();
             let action = state.actions.get(&self.action);
-            action.is_some_and(|action| action.goals.contains_key(id))
+            action.and_then(|action| Some(action.goals.get(id)?.1.clone()))
         };
-        if let Some(server) = self.server().filter(|_| under_way) {
+        if let Some((server, events)) = self.server().zip(under_way) {
+            events.cancel_answered(true);
             server.cancel(id);
         }
     }

@@ -31,7 +31,6 @@ mod params_file;
 mod resolver;
 mod revision;
 mod robot;
-mod ros_args;
 mod run;
 mod seen;
 mod stream;

@@ -16,9 +16,9 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use ros::bus::ParamValue;
+use ros::ros2::arguments::is_token;
 use saphyr_parser::Event;
 
-use crate::ros_args::is_token;
 use events::{Events, Problem};
 
 /// The largest file that is read.

@@ -438,6 +438,14 @@ struct TappedEvents {
 }
 
 impl GoalEvents for TappedEvents {
+    fn accepted(&self) {
+        self.events.accepted();
+    }
+
+    fn cancel_answered(&self, ends: bool) {
+        self.events.cancel_answered(ends);
+    }
+
     fn feedback(&self, feedback: Bytes) {
         self.events.feedback(feedback);
     }

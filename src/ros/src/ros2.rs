@@ -1,6 +1,7 @@
 //! ROS 2: the bus over DDS, by the crate `rtps`.
 
-mod actions;
+pub mod actions;
+pub mod arguments;
 mod bus;
 mod calls;
 mod client;

@@ -5,12 +5,12 @@ use std::path::Path;
 
 use anyhow::bail;
 use ros::bus::{ParamValue, RosVersion};
+use ros::ros2::arguments::{self, BEGIN, END, Kind, Part, Renamed, Rule};
 use ros::ros2::{names, process};
 
 use super::{Place, Robot};
 use crate::network::{self, Variable};
-use crate::params_file::Sections;
-use crate::ros_args::{self, BEGIN, END, Kind, Part, Renamed, Rule};
+use crate::params_file::{Sections, value};
 
 /// Parameters that begin so are settings of the stub.
 pub const SETTINGS: &str = "cloudroid.";
@@ -21,7 +21,7 @@ const LOG_CONFIG_FILE: &str = "--log-config-file";
 
 /// As [`Robot::read`].
 pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<Robot> {
-    let parts = ros_args::parse(argv)?;
+    let parts = arguments::parse(argv)?;
     let (name, node) = named(&parts, usual)?;
     let sections = sections(&parts)?;
     let parameters = sections.of(&node);
@@ -41,7 +41,7 @@ pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyho
 fn named(parts: &[Part], usual: &str) -> anyhow::Result<(String, String)> {
     let of = |renamed: Renamed, node: &str| {
         let rules = parts.iter().filter_map(rule);
-        let mut rules = rules.filter(|rule| rule.of == renamed && concerns(rule, node));
+        let mut rules = rules.filter(|rule| rule.of == renamed && rule.concerns(node));
         rules.next().map(|rule| rule.to.clone())
     };
     let name = of(Renamed::Node, usual).unwrap_or_else(|| usual.to_owned());
@@ -63,10 +63,6 @@ fn rule(part: &Part) -> Option<&Rule> {
     }
 }
 
-fn concerns(rule: &Rule, node: &str) -> bool {
-    rule.node.as_deref().is_none_or(|of| of == node)
-}
-
 /// All parameters that the command line gives to any node, in rcl's order.
 fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
     let mut sections = Sections::default();
@@ -77,7 +73,9 @@ fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
                     Some(node) => format!("/{node}"),
                     None => ALL.to_owned(),
                 };
-                sections.set(&nodes, given.name.clone(), given.value.clone());
+                let value = value::of_text(&given.value);
+                let value = value.map_err(|reason| arguments::no_value(&part.words, &reason))?;
+                sections.set(&nodes, given.name.clone(), value);
             }
             Kind::File(path) => sections.read(Path::new(path))?,
             _ => {}
@@ -100,8 +98,7 @@ fn for_the_cloud(
             Kind::Own => own.extend(part.words.clone()),
             Kind::Mark => is_for_ros = part.words == [BEGIN],
             Kind::Rule(rule) => {
-                let names_it =
-                    rule.of != Renamed::Name && names.iter().any(|name| concerns(rule, name));
+                let names_it = !rule.of.is_name() && names.iter().any(|name| rule.concerns(name));
                 match names_it {
                     true => {}
                     false if is_for_ros => given.extend(part.words.clone()),
@@ -121,7 +118,7 @@ fn for_the_cloud(
         if name.starts_with(SETTINGS) {
             continue;
         }
-        if !ros_args::is_parameter(name) {
+        if !arguments::is_parameter(name) {
             tracing::warn!(
                 "parameter {name} cannot be given on a command line: the node in the cloud has its default; rename it with letters, digits, _ and dots"
             );
@@ -254,6 +251,12 @@ people:
                 "/nowhere/p.yaml",
             ),
             ("--ros-args -p a", "-p a"),
+            ("--ros-args -p a:=", "-p a:=: there is no value"),
+            ("--ros-args -p a:={b:1}", "-p a:={b:1}"),
+            (
+                "--ros-args -p a:=[1,x]",
+                "-p a:=[1,x]: a list holds values of one type",
+            ),
         ] {
             let error = format!("{:#}", read(line).await.expect_err(line));
             assert!(error.contains(said), "{line}: {error}");

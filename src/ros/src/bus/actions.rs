@@ -36,6 +36,10 @@ pub struct GoalEnd {
 
 /// Hears how one goal gets on, in order. Must not block.
 pub trait GoalEvents: Send + Sync + 'static {
+    /// Its server has taken it. Told of where servers answer that (ROS 2), and not of a goal that was rejected.
+    fn accepted(&self) {}
+    /// Its server has answered a wish that it should end: whether it does. Told of as `accepted` is.
+    fn cancel_answered(&self, _ends: bool) {}
     /// Serialized feedback.
     fn feedback(&self, feedback: Bytes);
     /// It has ended, or the reason why nobody will ever know. The last event.

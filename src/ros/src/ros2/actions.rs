@@ -12,12 +12,13 @@
 
 mod client;
 mod goal_id;
+pub mod goal_server;
 mod messages;
 mod server;
 #[cfg(test)]
 mod tests;
 
-use crate::bus::{BusError, ServiceType, WireType};
+use crate::bus::{BusError, Qos, ServiceType, WireType};
 use crate::ros2::{interfaces, names};
 use crate::schema::ActionDef;
 
@@ -29,16 +30,23 @@ pub(super) use server::{Retired, Server};
 const QUEUE: u32 = 100;
 
 /// What an action is made of: names and types.
-struct Parts {
-    send_goal: (String, ServiceType),
-    get_result: (String, ServiceType),
-    cancel_goal: (String, ServiceType),
-    feedback: (String, WireType),
-    status: (String, WireType),
+#[derive(Debug, Clone)]
+pub struct Parts {
+    /// Takes goals, or not.
+    pub send_goal: (String, ServiceType),
+    /// Answers when a goal has ended.
+    pub get_result: (String, ServiceType),
+    /// Ends goals.
+    pub cancel_goal: (String, ServiceType),
+    /// Tells how goals get on.
+    pub feedback: (String, WireType),
+    /// Tells how all goals stand.
+    pub status: (String, WireType),
 }
 
 impl Parts {
-    fn of(action: &str, of: &ActionDef) -> Result<Self, BusError> {
+    /// Those of an action of this name and type; an error where it is one of ROS 1.
+    pub fn of(action: &str, of: &ActionDef) -> Result<Self, BusError> {
         let name = |part: &str| names::part_of_action(action, part);
         let Some(services) = &of.services else {
             return Err(BusError::Protocol {
@@ -57,5 +65,15 @@ impl Parts {
             feedback: (name("feedback"), WireType::of(&of.action_feedback)),
             status: (name("status"), WireType::of(&status)),
         })
+    }
+
+    /// What a server offers of its feedback.
+    pub fn feedback_qos() -> Qos {
+        Qos::keep_last(QUEUE as usize)
+    }
+
+    /// What a server offers of its statuses.
+    pub fn status_qos() -> Qos {
+        Qos::keep_last(1).latching(true)
     }
 }

@@ -68,8 +68,20 @@ pub fn action_part(name: &str) -> Option<(&str, &str)> {
 }
 
 /// The name of a part of an action: `/fib` and `send_goal` make `/fib/_action/send_goal`.
-pub(crate) fn part_of_action(action: &str, part: &str) -> String {
+pub fn part_of_action(action: &str, part: &str) -> String {
     format!("{action}{ACTION}{part}")
+}
+
+/// The absolute name of what a node of this absolute name calls `name`: `~` is the node itself.
+pub fn resolve(name: &str, node: &str) -> String {
+    if name.starts_with('/') {
+        return name.to_owned();
+    }
+    if let Some(own) = name.strip_prefix('~') {
+        return format!("{node}{own}");
+    }
+    let namespace = node.rsplit_once('/').map_or("", |(above, _)| above);
+    format!("{namespace}/{name}")
 }
 
 /// `std_msgs/msg/String` of DDS's name. What is not made by rosidl is called by its name in DDS.
@@ -186,6 +198,21 @@ mod tests {
             assert!(!is_global(bad), "{bad}");
         }
         assert!(!is_global(&format!("/{}", "x".repeat(MAX_NAME))));
+    }
+
+    #[test]
+    fn names_of_a_node_are_resolved() {
+        for (name, node, expected) in [
+            ("/work", "/r1/w", "/work"),
+            ("work", "/r1/w", "/r1/work"),
+            ("a/work", "/w", "/a/work"),
+            ("~/set", "/r1/w", "/r1/w/set"),
+            ("~", "/w", "/w"),
+        ] {
+            assert_eq!(resolve(name, node), expected);
+        }
+        let part = part_of_action("/a/fib", "status");
+        assert_eq!(action_part(&part), Some(("/a/fib", "status")));
     }
 
     #[test]

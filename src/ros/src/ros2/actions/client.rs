@@ -252,7 +252,7 @@ impl Shared {
             () = abandoned_for(CANCEL_WAITS, wished.clone()) => return Err(CLOSED.to_owned()),
         };
         match messages::read_accepted(&taken) {
-            Some(true) => {}
+            Some(true) => self.tell_accepted(id),
             Some(false) => return Ok(self.rejected()),
             None => return Err(format!("action {} answers what cannot be read", self.name)),
         }
@@ -297,12 +297,21 @@ impl Shared {
         let stamp = Time::default();
         let request = messages::write_cancel(GoalInfo { id, stamp });
         let action = &self.name;
-        match self.cancel_goal.call(request, CANCEL_WAITS).await {
+        let ends = match self.cancel_goal.call(request, CANCEL_WAITS).await {
             Ok(answer) => match messages::read_cancelled(&answer, id) {
-                Some(Ok(())) => {}
-                refused => tracing::debug!(action, %id, ?refused, "a goal is not cancelled"),
+                Some(Ok(())) => true,
+                refused => {
+                    tracing::debug!(action, %id, ?refused, "a goal is not cancelled");
+                    false
+                }
             },
-            Err(error) => tracing::debug!(action, %id, %error, "a goal cannot be cancelled"),
+            Err(error) => {
+                tracing::debug!(action, %id, %error, "a goal cannot be cancelled");
+                false
+            }
+        };
+        if let Some(events) = self.events(id) {
+            events.cancel_answered(ends);
         }
     }
 
@@ -334,13 +343,22 @@ impl Shared {
         })
     }
 
+    fn events(&self, id: GoalId) -> Option<Arc<dyn GoalEvents>> {
+        let goals = self.goals.lock();
+        goals.under_way.get(&id).map(|goal| goal.events.clone())
+    }
+
+    fn tell_accepted(&self, id: GoalId) {
+        if let Some(events) = self.events(id) {
+            events.accepted();
+        }
+    }
+
     fn tell_feedback(&self, bytes: &[u8]) {
         let Some(id) = messages::read_id(bytes) else {
             return;
         };
-        let goals = self.goals.lock();
-        let events = goals.under_way.get(&id).map(|goal| goal.events.clone());
-        drop(goals);
+        let events = self.events(id);
         let feedback = messages::behind_id(&self.of.feedback, bytes);
         if let (Some(events), Some(feedback)) = (events, feedback) {
             events.feedback(feedback);

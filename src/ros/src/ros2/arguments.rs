@@ -5,10 +5,7 @@
 //! PROGRAM own… --ros-args -r FROM:=TO -p NAME:=VALUE --params-file FILE … -- own… --ros-args …
 //! ```
 
-use anyhow::{anyhow, bail};
-use ros::bus::ParamValue;
-
-use crate::params_file::value;
+use super::names;
 
 /// What follows is for ROS, up to the end or to [`END`].
 pub const BEGIN: &str = "--ros-args";
@@ -59,8 +56,17 @@ pub struct Rule {
     pub node: Option<String>,
     /// What is renamed.
     pub of: Renamed,
+    /// The old name, as written.
+    pub from: String,
     /// The new name.
     pub to: String,
+}
+
+impl Rule {
+    /// Whether it holds for the node of this name, without namespace.
+    pub fn concerns(&self, node: &str) -> bool {
+        self.node.as_deref().is_none_or(|of| of == node)
+    }
 }
 
 /// What a rule renames.
@@ -72,24 +78,77 @@ pub enum Renamed {
     Namespace,
     /// Its topics and services.
     Name,
+    /// Its topics alone.
+    Topic,
+    /// Its services alone.
+    Service,
+}
+
+impl Renamed {
+    /// Whether it is a name of what the node has, and not its own.
+    pub fn is_name(self) -> bool {
+        !matches!(self, Self::Node | Self::Namespace)
+    }
 }
 
 /// `-p NODE:NAME:=VALUE`.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
     /// The node that it holds for; all of the process where absent.
     pub node: Option<String>,
     /// Its name; levels are parted by dots.
     pub name: String,
-    /// Its value.
-    pub value: ParamValue,
+    /// Its value, as written: YAML.
+    pub value: String,
+}
+
+/// An argument that rcl would not take either.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ArgumentError {
+    /// Something should follow.
+    #[error("nothing stands after {flag}, the last argument: give {flag} {form}")]
+    NoValue {
+        /// The argument.
+        flag: String,
+        /// What should follow.
+        form: &'static str,
+    },
+    /// What follows is not of the right form.
+    #[error("{flag} {given}: {reason}; {form}")]
+    Refused {
+        /// The argument.
+        flag: String,
+        /// What follows.
+        given: String,
+        /// What is wrong.
+        reason: String,
+        /// What is right.
+        form: &'static str,
+    },
+    /// It is none of ROS 2's.
+    #[error(
+        "{0} stands after {BEGIN} and is no argument of ROS 2; the program's own stand before {BEGIN} or after {END}"
+    )]
+    Unknown(String),
+}
+
+/// What is right of a rule, and of a parameter.
+const RULES: &str = "a rule is FROM:=TO";
+const PARAMETERS: &str = "a parameter is given as NAME:=VALUE";
+
+/// The error of a parameter whose value is none, for this reason; `words` are those by which it was given.
+pub fn no_value(words: &[String], reason: &str) -> ArgumentError {
+    match words {
+        [flag, given, ..] => refused(flag, given, reason, PARAMETERS),
+        _ => refused("-p", "", reason, PARAMETERS),
+    }
 }
 
 /// Takes a command line (without the program) apart.
 ///
 /// # Errors
 /// The argument that rcl would not take either, and why not.
-pub fn parse(argv: &[String]) -> anyhow::Result<Vec<Part>> {
+pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
     let mut parts = Vec::new();
     let mut words = argv.iter();
     let mut for_ros = false;
@@ -114,15 +173,13 @@ pub fn parse(argv: &[String]) -> anyhow::Result<Vec<Part>> {
             },
             "-r" | "--remap" => {
                 let given = value_of(word, words.next(), "FROM:=TO")?;
-                let rule = rule(given)
-                    .map_err(|reason| refused(word, given, &reason, "a rule is FROM:=TO"))?;
+                let rule = rule(given).map_err(|reason| refused(word, given, &reason, RULES))?;
                 part(vec![word, given], Kind::Rule(rule));
             }
             "-p" | "--param" => {
                 let given = value_of(word, words.next(), "NAME:=VALUE")?;
-                let parameter = parameter(given).map_err(|reason| {
-                    refused(word, given, &reason, "a parameter is given as NAME:=VALUE")
-                })?;
+                let parameter =
+                    parameter(given).map_err(|reason| refused(word, given, &reason, PARAMETERS))?;
                 part(vec![word, given], Kind::Parameter(parameter));
             }
             "--params-file" => {
@@ -134,22 +191,30 @@ pub fn parse(argv: &[String]) -> anyhow::Result<Vec<Part>> {
                 part(vec![word, given], Kind::Setting);
             }
             text if is_switch(text) => part(vec![word], Kind::Setting),
-            text => bail!(
-                "{text} stands after {BEGIN} and is no argument of ROS 2; the program's own stand before {BEGIN} or after {END}"
-            ),
+            text => return Err(ArgumentError::Unknown(text.to_owned())),
         }
     }
     Ok(parts)
 }
 
-fn value_of<'a>(flag: &str, next: Option<&'a String>, form: &str) -> anyhow::Result<&'a String> {
-    next.ok_or_else(|| {
-        anyhow!("nothing stands after {flag}, the last argument: give {flag} {form}")
+fn value_of<'a>(
+    flag: &str,
+    next: Option<&'a String>,
+    form: &'static str,
+) -> Result<&'a String, ArgumentError> {
+    next.ok_or_else(|| ArgumentError::NoValue {
+        flag: flag.to_owned(),
+        form,
     })
 }
 
-fn refused(flag: &str, given: &str, reason: &str, form: &str) -> anyhow::Error {
-    anyhow!("{flag} {given}: {reason}; {form}")
+fn refused(flag: &str, given: &str, reason: &str, form: &'static str) -> ArgumentError {
+    ArgumentError::Refused {
+        flag: flag.to_owned(),
+        given: given.to_owned(),
+        reason: reason.to_owned(),
+        form,
+    }
 }
 
 fn is_switch(text: &str) -> bool {
@@ -189,20 +254,27 @@ fn with_node(text: &str) -> Result<(Option<String>, &str), String> {
 fn rule(text: &str) -> Result<Rule, String> {
     let (from, to) = halves(text)?;
     // Rules for topics or services alone.
-    let kind = ["rostopic://", "rosservice://"];
-    let schemeless = kind.iter().find_map(|scheme| from.strip_prefix(scheme));
-    let (node, from) = match schemeless {
-        Some(name) => (None, name),
+    let kinds = [
+        ("rostopic://", Renamed::Topic),
+        ("rosservice://", Renamed::Service),
+    ];
+    let below = |name| {
+        let mut kinds = kinds.iter();
+        kinds.find_map(|(scheme, of)| Some((str::strip_prefix(name, scheme)?, *of)))
+    };
+    let (node, from, kind) = match below(from) {
+        Some((name, of)) => (None, name, Some(of)),
         None => {
             let (node, name) = with_node(from)?;
-            let below = kind.iter().find_map(|scheme| name.strip_prefix(scheme));
-            (node, below.unwrap_or(name))
+            let (name, of) = below(name).map_or((name, None), |(name, of)| (name, Some(of)));
+            (node, name, of)
         }
     };
-    let of = match from {
-        "__node" | "__name" if schemeless.is_none() => Renamed::Node,
-        "__ns" if schemeless.is_none() => Renamed::Namespace,
-        _ => Renamed::Name,
+    let of = match (kind, from) {
+        (None, "__node" | "__name") => Renamed::Node,
+        (None, "__ns") => Renamed::Namespace,
+        (None, _) => Renamed::Name,
+        (Some(of), _) => of,
     };
     match of {
         Renamed::Node if !is_token(to) => {
@@ -210,12 +282,12 @@ fn rule(text: &str) -> Result<Rule, String> {
                 "{to:?} is no name of a node (letters, digits and _; __ns:= sets the namespace)"
             ));
         }
-        Renamed::Namespace if to != "/" && !ros::ros2::names::is_global(to) => {
+        Renamed::Namespace if to != "/" && !names::is_global(to) => {
             return Err(format!(
                 "{to:?} is no namespace, which begins with / and does not end with it"
             ));
         }
-        Renamed::Name => {
+        of if of.is_name() => {
             for (side, name) in [("before", from), ("behind", to)] {
                 if !is_pattern(name) {
                     return Err(format!("{name:?} {side} := is no name"));
@@ -227,6 +299,7 @@ fn rule(text: &str) -> Result<Rule, String> {
     Ok(Rule {
         node,
         of,
+        from: from.to_owned(),
         to: to.to_owned(),
     })
 }
@@ -246,7 +319,7 @@ fn parameter(text: &str) -> Result<Parameter, String> {
     Ok(Parameter {
         node,
         name: name.to_owned(),
-        value: value::of_text(text)?,
+        value: text.to_owned(),
     })
 }
 

@@ -3,6 +3,7 @@
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use tokio::sync::watch;
 
@@ -21,12 +22,13 @@ const MAX_KEPT_BYTES: usize = 64 << 20;
 /// The answer to who asks for the result of a goal, once it has ended.
 pub(super) type Answer = watch::Receiver<Option<Bytes>>;
 
-#[derive(Default)]
 pub(super) struct Goals {
     known: HashMap<GoalId, Known>,
     /// Those that have ended, the first to be forgotten first, and when.
     ended: VecDeque<(Instant, GoalId)>,
     kept_bytes: usize,
+    /// Counts results that are kept.
+    budget: Budget,
     begun: u64,
     closed: bool,
 }
@@ -40,19 +42,22 @@ struct Known {
     /// Somebody has asked for its result.
     asked: bool,
     answer: watch::Sender<Option<Bytes>>,
-}
-
-/// Whom a request to cancel concerns.
-#[derive(Debug, PartialEq)]
-pub(super) struct Cancelled {
-    pub(super) code: CancelCode,
-    /// All that end now because they were asked to, now or before.
-    pub(super) canceling: Vec<GoalInfo>,
-    /// Those among them that have not been asked before.
-    pub(super) newly: Vec<GoalId>,
+    /// For its result.
+    permit: Option<Permit>,
 }
 
 impl Goals {
+    pub(super) fn new(budget: Budget) -> Self {
+        Self {
+            known: HashMap::new(),
+            ended: VecDeque::new(),
+            kept_bytes: 0,
+            budget,
+            begun: 0,
+            closed: false,
+        }
+    }
+
     /// Makes room for a goal, or says why there is none.
     pub(super) fn begin(&mut self, id: GoalId, accepted: Time) -> Result<(), String> {
         if self.closed {
@@ -71,23 +76,35 @@ impl Goals {
             status: Status::Unknown,
             asked: false,
             answer: watch::Sender::new(None),
+            permit: None,
         };
         self.known.insert(id, known);
         Ok(())
     }
 
+    /// It will be carried out.
+    pub(super) fn accepted(&mut self, id: GoalId) {
+        if let Some(known) = self.pending(id) {
+            known.status = Status::Accepted;
+        }
+    }
+
     /// It is carried out now. It may have ended already.
     pub(super) fn taken(&mut self, id: GoalId) {
-        if let Some(known) = self.pending(id) {
+        let known = self.known.get_mut(&id);
+        let waits = |known: &&mut Known| matches!(known.status, Status::Unknown | Status::Accepted);
+        if let Some(known) = known.filter(waits) {
             known.status = Status::Executing;
         }
     }
 
-    /// It is not carried out.
-    pub(super) fn refused(&mut self, id: GoalId) {
-        if self.pending(id).is_some() {
+    /// It is not carried out; false where it was accepted, or has ended.
+    pub(super) fn refused(&mut self, id: GoalId) -> bool {
+        let pending = self.pending(id).is_some();
+        if pending {
             self.known.remove(&id);
         }
+        pending
     }
 
     fn pending(&mut self, id: GoalId) -> Option<&mut Known> {
@@ -107,18 +124,26 @@ impl Goals {
 
     /// Ends a goal; false where there is none of this id under way.
     pub(super) fn end(&mut self, id: GoalId, status: Status, answer: Bytes, now: Instant) -> bool {
-        let known = self.known.get_mut(&id);
-        let Some(known) = known.filter(|known| !known.status.is_terminal()) else {
+        if !self.is_under_way(id) {
             return false;
-        };
-        known.status = status;
-        self.kept_bytes += answer.len();
-        known.answer.send_replace(Some(answer));
-        self.ended.push_back((now + KEPT, id));
-        while self.ended.len() > MAX_KEPT
-            || (self.kept_bytes > MAX_KEPT_BYTES && self.ended.len() > 1)
+        }
+        let size = answer.len();
+        self.kept_bytes += size;
+        while self.ended.len() >= MAX_KEPT
+            || (self.kept_bytes > MAX_KEPT_BYTES && !self.ended.is_empty())
         {
             self.forget_first();
+        }
+        let mut permit = self.budget.take(size);
+        while permit.is_err() && !self.ended.is_empty() {
+            self.forget_first();
+            permit = self.budget.take(size);
+        }
+        self.ended.push_back((now + KEPT, id));
+        if let Some(known) = self.known.get_mut(&id) {
+            known.status = status;
+            known.permit = permit.ok();
+            known.answer.send_replace(Some(answer));
         }
         true
     }
@@ -135,39 +160,47 @@ impl Goals {
         self.known.values().all(|known| known.asked)
     }
 
-    /// By the policy that `action_msgs/srv/CancelGoal` states: without an id all goals up to the stamp, and without a
-    /// stamp either all; with an id that one, and with a stamp also all up to it.
-    pub(super) fn cancel(&mut self, wanted: GoalInfo) -> Cancelled {
+    /// Whom a request to cancel concerns, the first one first, and whether each was asked to end before. By the policy that
+    /// `action_msgs/srv/CancelGoal` states: without an id all goals up to the stamp, and without a stamp either all; with
+    /// an id that one, and with a stamp also all up to it.
+    pub(super) fn concerned(&self, wanted: GoalInfo) -> Vec<(GoalInfo, bool)> {
         let zero = wanted.stamp == Time::default();
         let all = wanted.id == GoalId::NONE && zero;
-        let mut concerned: Vec<(u64, GoalInfo)> = Vec::new();
-        let mut newly = Vec::new();
-        for (id, known) in &mut self.known {
+        let mut concerned: Vec<(u64, GoalInfo, bool)> = Vec::new();
+        for (id, known) in &self.known {
             let stamped = !zero && known.accepted <= wanted.stamp;
-            if !(all || stamped || *id == wanted.id) {
-                continue;
-            }
-            if matches!(known.status, Status::Accepted | Status::Executing) {
-                known.status = Status::Canceling;
-                newly.push(*id);
-            }
-            if known.status == Status::Canceling {
-                concerned.push((known.number, known.info(*id)));
+            let before = match known.status {
+                Status::Canceling => true,
+                Status::Accepted | Status::Executing => false,
+                _ => continue,
+            };
+            if all || stamped || *id == wanted.id {
+                concerned.push((known.number, known.info(*id), before));
             }
         }
-        concerned.sort_by_key(|(number, _)| *number);
-        let code = match self.known.get(&wanted.id) {
-            _ if !concerned.is_empty() => CancelCode::None,
+        concerned.sort_by_key(|(number, ..)| *number);
+        let concerned = concerned.into_iter();
+        concerned.map(|(_, info, before)| (info, before)).collect()
+    }
+
+    /// What is answered to a request to cancel that concerns none.
+    pub(super) fn otherwise(&self, wanted: GoalInfo) -> CancelCode {
+        match self.known.get(&wanted.id) {
             Some(known) if known.status.is_terminal() => CancelCode::Terminated,
             _ if wanted.id == GoalId::NONE => CancelCode::Rejected,
             _ => CancelCode::UnknownGoal,
-        };
-        let canceling = concerned.into_iter().map(|(_, info)| info).collect();
-        Cancelled {
-            code,
-            canceling,
-            newly,
         }
+    }
+
+    /// It ends because it was asked to; false where it has ended, or was asked before.
+    pub(super) fn canceling(&mut self, id: GoalId) -> bool {
+        let known = self.known.get_mut(&id);
+        let goes_on =
+            |known: &&mut Known| matches!(known.status, Status::Accepted | Status::Executing);
+        let known = known.filter(goes_on);
+        known
+            .map(|known| known.status = Status::Canceling)
+            .is_some()
     }
 
     /// How all that were taken stand, the first one first.
@@ -228,9 +261,13 @@ mod tests {
         Time { secs, nsecs: 0 }
     }
 
+    fn goals() -> Goals {
+        Goals::new(Budget::unlimited())
+    }
+
     /// Goals 1, 2, … accepted at second 1, 2, … and taken.
     fn taken(count: u8) -> Goals {
-        let mut goals = Goals::default();
+        let mut goals = goals();
         for number in 1..=count {
             goals.begin(id(number), at(number.into())).unwrap();
             goals.taken(id(number));
@@ -259,25 +296,29 @@ mod tests {
         let mut goals = taken(4);
         end(&mut goals, 2, Instant::now());
         let (id, stamp) = wanted;
-        let mut cancelled = goals.cancel(GoalInfo { id, stamp });
-        let found: Vec<u8> = cancelled
-            .canceling
-            .iter()
-            .map(|info| info.id.0[0])
-            .collect();
-        assert_eq!((cancelled.code, &*found), (code, expected));
-        cancelled.newly.sort();
-        let newly: Vec<u8> = cancelled.newly.iter().map(|id| id.0[0]).collect();
-        assert_eq!(newly, expected);
+        let wanted = GoalInfo { id, stamp };
+        let concerned = |goals: &Goals| -> Vec<(u8, bool)> {
+            let concerned = goals.concerned(wanted).into_iter();
+            concerned
+                .map(|(info, before)| (info.id.0[0], before))
+                .collect()
+        };
+        let all = |before| expected.iter().map(|number| (*number, before)).collect();
+        let first: Vec<(u8, bool)> = all(false);
+        assert_eq!(concerned(&goals), first);
+        if first.is_empty() {
+            assert_eq!(goals.otherwise(wanted), code);
+        }
+        for number in expected {
+            assert!(goals.canceling(super::GoalId([*number; 16])));
+            assert!(!goals.canceling(super::GoalId([*number; 16])), "again");
+        }
         for (number, status) in told(&goals) {
             let canceling = status == Status::Canceling;
             assert_eq!(canceling, expected.contains(&number), "{number}");
         }
-        let again = goals.cancel(GoalInfo { id, stamp });
-        assert_eq!(
-            (again.canceling, again.newly),
-            (cancelled.canceling, vec![])
-        );
+        let again: Vec<(u8, bool)> = all(true);
+        assert_eq!(concerned(&goals), again);
     }
 
     #[test]
@@ -351,7 +392,7 @@ mod tests {
         assert!(end(&mut goals, 1, Instant::now()));
         goals.begin(id(2), at(1)).unwrap();
         assert!(goals.is_under_way(id(2)));
-        goals.refused(id(2));
+        assert!(goals.refused(id(2)));
         assert!(!goals.is_under_way(id(2)));
         goals.close();
         assert!(goals.begin(id(2), at(1)).is_err());
@@ -359,12 +400,49 @@ mod tests {
 
     #[test]
     fn a_goal_may_end_before_it_is_taken() {
-        let mut goals = Goals::default();
+        let mut goals = goals();
         goals.begin(id(1), at(1)).unwrap();
         assert_eq!(told(&goals), []);
         assert!(end(&mut goals, 1, Instant::now()));
         goals.taken(id(1));
-        goals.refused(id(1));
+        assert!(!goals.refused(id(1)));
         assert_eq!(told(&goals), [(1, Status::Succeeded)]);
+    }
+
+    #[test]
+    fn a_goal_may_wait_before_it_is_carried_out() {
+        let mut goals = taken(1);
+        goals.begin(id(2), at(2)).unwrap();
+        goals.accepted(id(2));
+        goals.accepted(id(1));
+        let statuses = [(1, Status::Executing), (2, Status::Accepted)];
+        assert_eq!(told(&goals), statuses);
+        assert!(!goals.refused(id(2)), "its sender was told otherwise");
+        goals.taken(id(2));
+        assert_eq!(
+            told(&goals),
+            [(1, Status::Executing), (2, Status::Executing)]
+        );
+    }
+
+    #[test]
+    fn results_that_are_kept_count_in_a_budget() {
+        let now = Instant::now();
+        let budget = Budget::new("the robot", 250);
+        let mut goals = Goals::new(budget.clone());
+        let result = || Bytes::from(vec![0; 100]);
+        for number in 1..=3 {
+            goals.begin(id(number), at(1)).unwrap();
+            assert!(goals.end(id(number), Status::Succeeded, result(), now));
+        }
+        assert!(goals.answer(id(1)).is_none(), "there was no room");
+        assert!(goals.answer(id(2)).is_some() && goals.answer(id(3)).is_some());
+        assert_eq!(budget.used(), 200);
+        // The last one is kept all the same.
+        goals.begin(id(4), at(1)).unwrap();
+        let large = Bytes::from(vec![0; 300]);
+        assert!(goals.end(id(4), Status::Succeeded, large, now));
+        assert!(goals.answer(id(3)).is_none() && goals.answer(id(4)).is_some());
+        assert_eq!(budget.used(), 0);
     }
 }
