@@ -36,6 +36,7 @@ use api::{PushEvent, PushOptions};
 use catalogue::{Catalogue, names};
 use choreographer::Choreographer;
 use reach::Opener;
+use reach::group::shareable;
 use rootfs_builder::{BuildEvent, BuildOutcome, Builder, PushRequest, Source};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
@@ -254,9 +255,6 @@ impl Pusher {
         report: &Reporter,
     ) -> Result<Vec<api::push::Layer>, Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
-        if plan.shared.is_some() {
-            shared::check_ros(built.flavour.ros.bus())?;
-        }
         report.step("starting it once to find its interface").await;
         for warning in self.choreographer.check_grants(&plan.grants)? {
             report.warning(warning).await;
@@ -279,7 +277,10 @@ impl Pusher {
             }
         }
         if plan.shared.is_some() {
-            shared::check_interface(&interface)?;
+            shared::check_interface(built.flavour.ros.bus(), &interface)?;
+            for remark in shareable::remarks(&interface) {
+                report.warning(remark).await;
+            }
         }
         // The token may have been revoked meanwhile.
         by.may(&name)?;

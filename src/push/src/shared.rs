@@ -43,24 +43,12 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
     Ok(())
 }
 
-/// Refuses a ROS whose services robots cannot share.
-pub(crate) fn check_ros(ros: RosVersion) -> Result<(), Error> {
-    match ros {
-        RosVersion::One => Ok(()),
-        RosVersion::Two => Err(Error::Failed {
-            message: "robots cannot share a service of ROS 2: how goals of its actions, and the names of its nodes, are passed on between robots and servants is known for ROS 1 alone".to_owned(),
-            next: Some(ALONE.to_owned()),
-            log: Vec::new(),
-        }),
-    }
-}
-
 /// What to do instead.
 const ALONE: &str = "push it without --shared, then each robot has a servant of its own";
 
 /// Refuses an interface that robots cannot share, with what was found.
-pub(crate) fn check_interface(interface: &Interface) -> Result<(), Error> {
-    shareable::check(interface).map_err(|error| Error::Failed {
+pub(crate) fn check_interface(ros: RosVersion, interface: &Interface) -> Result<(), Error> {
+    shareable::check(ros, interface).map_err(|error| Error::Failed {
         message: error.to_string(),
         next: Some(format!(
             "{ALONE}; or push only the nodes that answer services and actions, with --node"
@@ -74,16 +62,6 @@ mod tests {
     use api::Shared;
 
     use super::*;
-
-    #[test]
-    fn services_of_ros_2_are_not_shared() {
-        assert!(check_ros(RosVersion::One).is_ok());
-        let Err(Error::Failed { message, next, .. }) = check_ros(RosVersion::Two) else {
-            panic!("it is refused");
-        };
-        assert!(message.contains("a service of ROS 2"), "{message}");
-        assert!(next.is_some_and(|next| next.contains("without --shared")));
-    }
 
     #[test]
     fn numbers_that_contradict_each_other_are_refused() {

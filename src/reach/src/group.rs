@@ -11,11 +11,14 @@
 //! topic, no parameter, no node of another robot. Its rosbridge clients have the deployer's names, its stubs those that the
 //! nodes would have on the robot. What can be shared so is told by [`shareable`].
 
+mod action_ends;
+mod action_parts;
 mod action_topics;
 mod bus;
 pub mod dispatch;
 mod goals;
 mod names;
+mod node_ends;
 mod nodes;
 mod seat;
 pub mod shareable;
@@ -32,7 +35,7 @@ use futures_util::future::{AbortHandle, Aborted, BoxFuture, abortable};
 use futures_util::stream::FuturesUnordered;
 use package::interface::Interface;
 use parking_lot::Mutex;
-use ros::bus::{ActionClient, Bus, BusError, CallFate, Digest, Graph, RosVersion};
+use ros::bus::{ActionClient, Bus, BusError, CallFate, Digest, RosVersion};
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
@@ -92,11 +95,12 @@ pub struct Group {
     ros: RosVersion,
     distribution: String,
     interface: Interface,
+    /// What parameters its nodes had when the interface was found, by name.
+    values: BTreeMap<String, serde_json::Value>,
     state: Mutex<State>,
     members: watch::Sender<BTreeMap<Member, Arc<Servant>>>,
-    /// What robots see of the interface as it was deployed, and the same as a graph.
+    /// What robots see of the interface as it was deployed.
     whole: Arc<View>,
-    graph: Arc<Graph>,
     counts: Counts,
     robots: AtomicU64,
 }
@@ -155,8 +159,13 @@ impl Group {
         interface: &Interface,
         rules: Rules,
     ) -> Arc<Group> {
+        let values = interface.parameters.iter().filter_map(|parameter| {
+            let value = parameter.value.clone()?;
+            Some((parameter.name.clone(), value))
+        });
+        let values = values.collect();
         let interface = shareable::shown(interface);
-        let whole = Arc::new(View::whole(&interface));
+        let whole = Arc::new(View::whole(ros, &interface));
         let state = State {
             dispatcher: Dispatcher::new(rules),
             doors: HashMap::new(),
@@ -167,9 +176,9 @@ impl Group {
             ros,
             distribution: distribution.to_owned(),
             interface,
+            values,
             state: Mutex::new(state),
             members: watch::Sender::default(),
-            graph: Arc::new(whole.graph(1)),
             whole,
             counts: Counts::default(),
             robots: AtomicU64::new(0),

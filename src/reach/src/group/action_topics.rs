@@ -15,7 +15,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, BusError, GoalEnd, GoalEvents, Matched, Message, MessageSender, Outcome, Peer,
-    PeerId, Publisher, Qos, Subscription, WireType, message_queue,
+    PeerId, Publisher, Qos, RosVersion, Subscription, WireType, message_queue,
 };
 use ros::codec::Time;
 use ros::ros1::actions::messages::{self, GoalId, GoalState, Status};
@@ -24,6 +24,7 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::Group;
+use super::action_ends::{End, ends_of};
 use super::dispatch::Robot;
 use super::goals::GroupClient;
 
@@ -38,49 +39,6 @@ const GOALS: usize = 256;
 const ENDED: usize = 256;
 /// Bytes of a goal's id, which each status repeats.
 const LONGEST_ID: usize = 1024;
-
-/// One of the five.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum End {
-    Goal,
-    Cancel,
-    Feedback,
-    Result,
-    Status,
-}
-
-impl End {
-    const ALL: [(End, &str); 5] = [
-        (End::Goal, "/goal"),
-        (End::Cancel, "/cancel"),
-        (End::Feedback, "/feedback"),
-        (End::Result, "/result"),
-        (End::Status, "/status"),
-    ];
-
-    /// Whether clients publish it.
-    pub(super) fn is_of_clients(self) -> bool {
-        matches!(self, End::Goal | End::Cancel)
-    }
-
-    /// Its topic's type, of an action of this type.
-    pub(super) fn type_name(self, action: &str) -> String {
-        match self {
-            End::Goal => format!("{action}ActionGoal"),
-            End::Feedback => format!("{action}ActionFeedback"),
-            End::Result => format!("{action}ActionResult"),
-            End::Cancel => "actionlib_msgs/GoalID".to_owned(),
-            End::Status => "actionlib_msgs/GoalStatusArray".to_owned(),
-        }
-    }
-}
-
-/// The topics of an action.
-pub(super) fn topics_of(action: &str) -> impl Iterator<Item = (End, String)> + '_ {
-    End::ALL
-        .into_iter()
-        .map(move |(end, suffix)| (end, format!("{action}{suffix}")))
-}
 
 /// One action of one robot.
 pub(super) struct ActionTopics {
@@ -122,11 +80,12 @@ impl ActionTopics {
         registry: &Registry,
         budget: &Budget,
     ) -> Result<Arc<ActionTopics>, BusError> {
-        let types = End::ALL.into_iter().map(|(end, suffix)| {
+        let types = ends_of(RosVersion::One, name).into_iter();
+        let types = types.map(|(end, topic)| {
             let type_name = end.type_name(&of.name);
             let found = registry.message(&type_name);
             let found = found.map_err(|error| BusError::Protocol {
-                what: format!("{name}{suffix}"),
+                what: topic,
                 reason: error.to_string(),
             })?;
             Ok((end, Arc::new(WireType::of(&found))))

@@ -9,17 +9,23 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Publisher, Qos,
-    RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
+    NodeParameters, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
+    WireType,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::watch;
 
-use super::Group;
-use super::action_topics::{ActionTopics, End};
+use super::action_ends::End;
+use super::action_parts::{ActionParts, Notices};
+use super::action_topics::ActionTopics;
 use super::dispatch::Robot;
 use super::goals::GroupClient;
-use super::view::{Shown, View};
+use super::view::{Shown, ShownAction, View};
+use super::{Group, node_ends};
+
+/// What is not offered where somebody asks for a parameter.
+const PARAMETER: &str = "a parameter of its nodes";
 
 /// One robot's.
 pub(super) struct GroupBus {
@@ -28,41 +34,94 @@ pub(super) struct GroupBus {
     registry: Arc<Registry>,
     /// Counts what waits here for servants.
     budget: Budget,
+    notices: Notices,
     view: Mutex<Arc<View>>,
     graph: watch::Sender<Arc<Graph>>,
-    /// By name in the interface and node, as far as they are used by their topics.
-    actions: Mutex<HashMap<(String, String), Arc<ActionTopics>>>,
+    /// By name in the interface and node, as far as they are used by their parts.
+    actions: Mutex<HashMap<(String, String), Action>>,
+}
+
+/// An action that is used by its parts.
+#[derive(Clone)]
+enum Action {
+    One(Arc<ActionTopics>),
+    Two(Arc<ActionParts>),
+}
+
+impl Action {
+    fn cancel_all(&self) {
+        match self {
+            Action::One(topics) => topics.cancel_all(),
+            Action::Two(parts) => parts.cancel_all(),
+        }
+    }
 }
 
 impl GroupBus {
     /// The end of an action that a topic is.
-    fn end(&self, topic: &str) -> Result<(End, Arc<ActionTopics>), BusError> {
+    fn topic(&self, topic: &str) -> Result<(End, Action), BusError> {
         let view = self.view();
-        let Some((action, end)) = view.action_of(topic) else {
-            return Err(BusError::NotShared(format!("topic {topic}")));
+        match view.topic(topic) {
+            Some((action, end)) => Ok((end, self.action(action)?)),
+            None => Err(BusError::NotShared(format!("topic {topic}"))),
+        }
+    }
+
+    /// The end of an action that a service is; none where it is a service of its own.
+    fn action_service(&self, service: &str) -> Result<Option<(End, Arc<ActionParts>)>, BusError> {
+        let view = self.view();
+        let Some((action, end)) = view.action_service(service) else {
+            return Ok(None);
         };
+        match self.action(action)? {
+            Action::Two(parts) => Ok(Some((end, parts))),
+            Action::One(_) => Ok(None),
+        }
+    }
+
+    fn action(&self, action: &ShownAction) -> Result<Action, BusError> {
         let Shown { of: name, node } = &action.shown;
         let mut actions = self.actions.lock();
         let key = (name.clone(), node.clone());
         if let Some(known) = actions.get(&key) {
-            return Ok((end, Arc::clone(known)));
+            return Ok(known.clone());
         }
         let of = self.registry.action(&action.type_name);
         let of = of.map_err(|error| BusError::Protocol {
             what: format!("action {name}"),
             reason: error.to_string(),
         })?;
-        let names = (&**name, &**node);
-        let topics = ActionTopics::new(
-            &self.group,
-            self.robot,
-            names,
-            &of,
-            &self.registry,
-            &self.budget,
-        )?;
-        actions.insert(key, Arc::clone(&topics));
-        Ok((end, topics))
+        let (group, names) = (&self.group, (&**name, &**node));
+        let made = match group.ros {
+            RosVersion::One => Action::One(ActionTopics::new(
+                group,
+                self.robot,
+                names,
+                &of,
+                &self.registry,
+                &self.budget,
+            )?),
+            RosVersion::Two => Action::Two(ActionParts::new(
+                group,
+                self.robot,
+                names,
+                &of,
+                &self.budget,
+                &self.notices,
+            )?),
+        };
+        actions.insert(key, made.clone());
+        Ok(made)
+    }
+
+    /// Which ROS its nodes are of.
+    pub(super) fn ros(&self) -> RosVersion {
+        self.group.ros
+    }
+
+    /// What a node of the group had this parameter set to when the interface was found.
+    pub(super) fn value(&self, parameter: &str) -> Option<&serde_json::Value> {
+        self.group.values.get(parameter)
     }
 
     pub(super) fn interface(&self) -> &package::interface::Interface {
@@ -81,15 +140,19 @@ impl GroupBus {
             let mut all = view.actions.values().map(|action| &action.shown);
             all.any(|shown| shown.of == *name && shown.node == *node)
         };
-        actions.retain(|key, topics| {
+        actions.retain(|key, action| {
             let stays = shown(key);
             if !stays {
-                topics.cancel_all();
+                action.cancel_all();
             }
             stays
         });
-        self.graph
-            .send_modify(|graph| *graph = Arc::new(view.graph(graph.generation + 1)));
+        self.graph.send_modify(|graph| {
+            let next = self
+                .group
+                .graph(&view, &self.registry, graph.generation + 1);
+            *graph = Arc::new(next);
+        });
         *now = Arc::new(view);
     }
 }
@@ -106,36 +169,49 @@ impl Drop for GroupBus {
 
 impl Group {
     /// Two buses for one robot, one that shows the interface as it was deployed, and one that shows nothing yet; `registry`
-    /// holds the definitions of its actions, what waits for servants counts in `budget`.
+    /// holds the definitions of its services and actions, what waits for servants counts in `budget`, and what the robot should know of
+    /// is told to `notices`.
     pub(super) fn buses(
         self: &Arc<Self>,
         registry: &Arc<Registry>,
         budget: &Budget,
+        notices: &Notices,
     ) -> (Arc<GroupBus>, Arc<GroupBus>) {
         let robot = self
             .robots
             .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        let bus = |view: &Arc<View>, graph: &Arc<Graph>| {
+        let bus = |view: &Arc<View>, generation| {
+            let graph = self.graph(view, registry, generation);
             Arc::new(GroupBus {
                 group: Arc::clone(self),
                 robot,
                 registry: Arc::clone(registry),
                 budget: budget.clone(),
+                notices: notices.clone(),
                 view: Mutex::new(Arc::clone(view)),
-                graph: watch::Sender::new(Arc::clone(graph)),
+                graph: watch::Sender::new(Arc::new(graph)),
                 actions: Mutex::default(),
             })
         };
-        (
-            bus(&self.whole, &self.graph),
-            bus(&Arc::default(), &Arc::default()),
-        )
+        (bus(&self.whole, 1), bus(&Arc::default(), 0))
     }
 
     /// The first of them.
     #[cfg(test)]
     pub(super) fn bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
-        self.buses(registry, budget).0
+        let (notices, _) = tokio::sync::mpsc::unbounded_channel();
+        self.buses(registry, budget, &notices).0
+    }
+
+    fn graph(&self, view: &View, registry: &Registry, generation: u64) -> Graph {
+        let ends = match self.ros {
+            RosVersion::One => Default::default(),
+            RosVersion::Two => node_ends::all(view, &self.interface, registry),
+        };
+        Graph {
+            ends,
+            ..view.graph(self.ros, generation)
+        }
     }
 
     fn service(&self, name: &str) -> Option<&package::interface::Service> {
@@ -174,8 +250,9 @@ impl Bus for GroupBus {
         of: WireType,
         qos: Qos,
     ) -> Result<Subscription, BusError> {
-        match self.end(topic)? {
-            (end, topics) if !end.is_of_clients() => topics.subscribe(end, &of, qos),
+        match self.topic(topic)? {
+            (end, Action::One(topics)) if !end.is_of_clients() => topics.subscribe(end, &of, qos),
+            (end, Action::Two(parts)) => parts.subscribe(end, &of, qos),
             // Others' goals.
             _ => Err(BusError::NotShared(format!("listening to {topic}"))),
         }
@@ -187,8 +264,8 @@ impl Bus for GroupBus {
         of: WireType,
         _qos: Qos,
     ) -> Result<Box<dyn Publisher>, BusError> {
-        match self.end(topic)? {
-            (end, topics) if end.is_of_clients() => topics.advertise(end, &of),
+        match self.topic(topic)? {
+            (end, Action::One(topics)) if end.is_of_clients() => topics.advertise(end, &of),
             _ => Err(BusError::NotShared(format!("publishing {topic}"))),
         }
     }
@@ -200,6 +277,9 @@ impl Bus for GroupBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
+        if let Some((end, parts)) = self.action_service(service)? {
+            return parts.call((end, service), digest, request, timeout).await;
+        }
         let known = self.service(service)?;
         let group = &self.group;
         group
@@ -208,18 +288,27 @@ impl Bus for GroupBus {
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
+        if let Some((end, parts)) = self.action_service(service)? {
+            return Ok(parts.service_type(end).clone());
+        }
         let known = self.service(service)?;
         if known.md5.is_empty() {
             let servant = self.group.members.borrow().values().next().cloned();
             let servant = servant.ok_or_else(|| BusError::NoService(service.to_owned()))?;
             return servant.bus.service_type(&known.name).await;
         }
-        Ok(ServiceType::new(&*known.type_name, &known.md5))
+        Ok(node_ends::service_type(
+            self.group.ros,
+            known,
+            &self.registry,
+        ))
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
-        let (end, topics) = self.end(topic)?;
-        Ok(topics.wire_type(end))
+        Ok(match self.topic(topic)? {
+            (end, Action::One(topics)) => topics.wire_type(end),
+            (end, Action::Two(parts)) => parts.wire_type(end).clone(),
+        })
     }
 
     async fn serve(
@@ -251,5 +340,14 @@ impl Bus for GroupBus {
         _handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError> {
         Err(BusError::NotShared(format!("serving {action}")))
+    }
+
+    /// Those of the nodes are the deployer's.
+    fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
+        Err(BusError::NotShared(PARAMETER.to_owned()))
+    }
+
+    fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        Err(BusError::NotShared(PARAMETER.to_owned()))
     }
 }

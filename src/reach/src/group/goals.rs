@@ -12,8 +12,9 @@ use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
 use parking_lot::Mutex;
 use ros::bus::{ActionClient, BusError, GoalEnd, GoalEvents, Outcome};
+use ros::codec::default_message;
 use ros::schema::ActionDef;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -27,13 +28,43 @@ const MOST: usize = 256;
 /// How long a node may take to end a goal whose robot has gone. Then its servant carries out other robots' goals.
 const GONE: Duration = Duration::from_secs(10);
 
+/// Hears of a goal what only a group can tell.
+pub(super) trait GroupEvents: GoalEvents {
+    /// No servant has it, and the group keeps it until one is free.
+    fn waits(&self) {}
+}
+
+/// Who hears of a goal as of any server's.
+struct OfAny(Arc<dyn GoalEvents>);
+
+impl GoalEvents for OfAny {
+    fn accepted(&self) {
+        self.0.accepted();
+    }
+
+    fn cancel_answered(&self, ends: bool) {
+        self.0.cancel_answered(ends);
+    }
+
+    fn feedback(&self, feedback: Bytes) {
+        self.0.feedback(feedback);
+    }
+
+    fn ended(&self, end: Result<GoalEnd, String>) {
+        self.0.ended(end);
+    }
+}
+
+impl GroupEvents for OfAny {}
+
 /// One action, as a robot's.
 pub(super) struct GroupClient {
     group: Arc<Group>,
     robot: Robot,
     name: Arc<str>,
     of: Arc<ActionDef>,
-    goals: Arc<Mutex<HashMap<String, CancellationToken>>>,
+    /// Those that have not ended, with how often each was to be cancelled.
+    goals: Arc<Mutex<HashMap<String, watch::Sender<u32>>>>,
     gone: CancellationToken,
 }
 
@@ -52,6 +83,49 @@ impl GroupClient {
             goals: Arc::default(),
             gone: CancellationToken::new(),
         }
+    }
+
+    /// As [`ActionClient::send`], for who wants to hear more.
+    pub(super) fn sends(&self, id: &str, goal: Bytes, events: Arc<dyn GroupEvents>) {
+        let (wishes, wished) = watch::channel(0);
+        {
+            let mut goals = self.goals.lock();
+            let refused = match goals.len() {
+                _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
+                MOST.. => Some(format!(
+                    "{MOST} goals of this robot have not ended; wait for one of them"
+                )),
+                _ => None,
+            };
+            if let Some(text) = refused {
+                let end = GoalEnd {
+                    outcome: Outcome::Rejected,
+                    text,
+                    result: default_message(&self.of.result).into(),
+                };
+                // Not at once: whoever sends may hold what hears of it.
+                tokio::spawn(async move { events.ended(Ok(end)) });
+                return;
+            }
+            goals.insert(id.to_owned(), wishes);
+        }
+        let errand = self
+            .group
+            .begin(self.robot, Kind::Goal(Arc::clone(&self.name)));
+        let goal = Goal {
+            // Robots, and nodes of one robot, do not know each other's ids.
+            id: format!("{}-{id}", errand.ticket),
+            body: goal,
+            name: Arc::clone(&self.name),
+            of: Arc::clone(&self.of),
+            gone: self.gone.clone(),
+        };
+        let (goals, id) = (Arc::clone(&self.goals), id.to_owned());
+        tokio::spawn(async move {
+            let end = goal.follow(errand, wished, &*events).await;
+            goals.lock().remove(&id);
+            events.ended(end);
+        });
     }
 
     /// Nobody waits for the goals any more: they are cancelled, and not followed for long.
@@ -89,51 +163,12 @@ impl ActionClient for GroupClient {
     }
 
     fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        let cancelled = self.gone.child_token();
-        {
-            let mut goals = self.goals.lock();
-            let refused = match goals.len() {
-                _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
-                MOST.. => Some(format!(
-                    "{MOST} goals of this robot have not ended; wait for one of them"
-                )),
-                _ => None,
-            };
-            if let Some(text) = refused {
-                let end = GoalEnd {
-                    outcome: Outcome::Rejected,
-                    text,
-                    result: vec![0; self.of.result.min_size()].into(),
-                };
-                // Not at once: whoever sends may hold what hears of it.
-                tokio::spawn(async move { events.ended(Ok(end)) });
-                return;
-            }
-            goals.insert(id.to_owned(), cancelled.clone());
-        }
-        let errand = self
-            .group
-            .begin(self.robot, Kind::Goal(Arc::clone(&self.name)));
-        let goal = Goal {
-            // Robots, and nodes of one robot, do not know each other's ids.
-            id: format!("{}-{id}", errand.ticket),
-            body: goal,
-            name: Arc::clone(&self.name),
-            of: Arc::clone(&self.of),
-            cancelled,
-            gone: self.gone.clone(),
-        };
-        let (goals, id) = (Arc::clone(&self.goals), id.to_owned());
-        tokio::spawn(async move {
-            let end = goal.follow(errand, &events).await;
-            goals.lock().remove(&id);
-            events.ended(end);
-        });
+        self.sends(id, goal, Arc::new(OfAny(events)));
     }
 
     fn cancel(&self, id: &str) {
-        if let Some(cancelled) = self.goals.lock().get(id) {
-            cancelled.cancel();
+        if let Some(wishes) = self.goals.lock().get(id) {
+            wishes.send_modify(|wishes| *wishes += 1);
         }
     }
 }
@@ -149,13 +184,14 @@ struct Goal {
     body: Bytes,
     name: Arc<str>,
     of: Arc<ActionDef>,
-    cancelled: CancellationToken,
     /// Its robot has gone.
     gone: CancellationToken,
 }
 
 /// What a servant says of a goal.
 enum Said {
+    Accepted,
+    CancelAnswered(bool),
     Feedback(Bytes),
     Ended(Result<GoalEnd, String>),
 }
@@ -165,17 +201,27 @@ struct Ear {
     said: mpsc::UnboundedSender<(Arc<Servant>, Said)>,
 }
 
+impl Ear {
+    fn tell(&self, said: Said) {
+        let _ = self.said.send((Arc::clone(&self.servant), said));
+    }
+}
+
 impl GoalEvents for Ear {
+    fn accepted(&self) {
+        self.tell(Said::Accepted);
+    }
+
+    fn cancel_answered(&self, ends: bool) {
+        self.tell(Said::CancelAnswered(ends));
+    }
+
     fn feedback(&self, feedback: Bytes) {
-        let _ = self
-            .said
-            .send((Arc::clone(&self.servant), Said::Feedback(feedback)));
+        self.tell(Said::Feedback(feedback));
     }
 
     fn ended(&self, end: Result<GoalEnd, String>) {
-        let _ = self
-            .said
-            .send((Arc::clone(&self.servant), Said::Ended(end)));
+        self.tell(Said::Ended(end));
     }
 }
 
@@ -187,26 +233,37 @@ impl Goal {
     async fn follow(
         &self,
         mut errand: Errand,
-        events: &Arc<dyn GoalEvents>,
+        mut wished: watch::Receiver<u32>,
+        events: &dyn GroupEvents,
     ) -> Result<GoalEnd, String> {
         let (group, began) = (Arc::clone(&errand.group), Instant::now());
         let (sender, mut said) = mpsc::unbounded_channel::<(Arc<Servant>, Said)>();
         let mut sending: FuturesUnordered<Sending> = FuturesUnordered::new();
         let mut at: Option<(Arc<Servant>, Arc<dyn ActionClient>)> = None;
         let mut last: Option<Arc<Servant>> = None;
-        let mut told_to_end = false;
+        let (mut told_to_end, mut waits) = (false, false);
         let given_up = async {
             self.gone.cancelled().await;
             tokio::time::sleep(GONE).await;
         };
         let mut given_up = std::pin::pin!(given_up);
         loop {
+            let idle = at.is_none() && sending.is_empty();
+            let end_wanted = async {
+                tokio::select! {
+                    () = self.gone.cancelled(), if !told_to_end => {}
+                    Ok(()) = wished.changed() => {}
+                    else => std::future::pending().await,
+                }
+            };
             tokio::select! {
                 biased;
                 Some((servant, what)) = said.recv() => {
                     let here = at.as_ref().is_some_and(|(now, _)| now.member == servant.member);
                     match what {
                         _ if !here => {}
+                        Said::Accepted => events.accepted(),
+                        Said::CancelAnswered(ends) => events.cancel_answered(ends),
                         Said::Feedback(feedback) => events.feedback(feedback),
                         Said::Ended(Ok(end)) => {
                             errand.ended(&servant, End::Answered);
@@ -272,12 +329,17 @@ impl Goal {
                     tracing::warn!("goal {} of {}: {words}", self.id, self.name);
                     return Err(words);
                 }
-                () = self.cancelled.cancelled(), if !told_to_end => {
+                () = end_wanted => {
                     told_to_end = true;
                     match &at {
                         Some((_, client)) => client.cancel(&self.id),
                         None => return Ok(self.recalled()),
                     }
+                }
+                // Nothing else is to be done now.
+                () = std::future::ready(()), if idle && !waits => {
+                    waits = true;
+                    events.waits();
                 }
             }
         }
@@ -293,7 +355,7 @@ impl Goal {
         GoalEnd {
             outcome: Outcome::Canceled,
             text: "it was cancelled before a servant had begun with it".to_owned(),
-            result: vec![0; self.of.result.min_size()].into(),
+            result: default_message(&self.of.result).into(),
         }
     }
 }

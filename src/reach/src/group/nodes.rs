@@ -7,8 +7,9 @@ use std::sync::{Arc, Weak};
 use async_trait::async_trait;
 use link::control::{Decision, Exit, Hello, Node, Request};
 use parking_lot::Mutex;
-use ros::bus::ParamValue;
+use ros::bus::{ParamValue, RosVersion};
 use ros::ros1::names;
+use ros::ros2::arguments::{self, Kind};
 use servant::spec::NodeSpec;
 use tokio::sync::{mpsc, watch};
 
@@ -63,14 +64,15 @@ impl SharedNodes {
 
     fn view(&self, node: &Node) -> Result<View, String> {
         let planned = planned(&self.recorded, node)?;
+        let ros = self.bus.ros();
         let alias = Alias {
             node: &planned.name,
             only: self.recorded.nodes.len() == 1,
-            deployed: Names::new(&planned.name, &planned.argv),
+            deployed: Names::new(ros, &planned.name, &planned.argv),
             name: &node.name,
-            robot: Names::new(&node.name, &node.argv),
+            robot: Names::new(ros, &node.name, &node.argv),
         };
-        Ok(View::of_node(self.bus.interface(), &alias))
+        Ok(View::of_node(ros, self.bus.interface(), &alias))
     }
 }
 
@@ -105,11 +107,25 @@ fn planned<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a NodeSpec, Stri
     }
 }
 
-/// What a robot gives a node that it does not heed: private parameters, and arguments that are neither these nor remaps.
-fn unheeded(recorded: &Recorded, hello: &Hello) -> BTreeSet<String> {
+/// What a robot gives a node that it does not heed: private parameters, and arguments that are neither these nor remaps. `value` is
+/// what a parameter of the group's node is known to be.
+fn unheeded<'a>(
+    recorded: &'a Recorded,
+    hello: &Hello,
+    value: impl Fn(&str) -> Option<&'a serde_json::Value>,
+) -> BTreeSet<String> {
     let Ok(planned) = planned(recorded, &hello.node) else {
         return BTreeSet::new();
     };
+    match recorded.flavour.ros.bus() {
+        RosVersion::One => unheeded_one(recorded, planned, hello),
+        RosVersion::Two => unheeded_two(planned, &hello.node.argv, |name| {
+            value(&format!("{}/{name}", planned.name))
+        }),
+    }
+}
+
+fn unheeded_one(recorded: &Recorded, planned: &NodeSpec, hello: &Hello) -> BTreeSet<String> {
     let deployed = |name: &str| recorded.parameters.get(&format!("{}/{name}", planned.name));
     let mut given = BTreeSet::new();
     if let Some(own) = below(&hello.parameters, &hello.node.name) {
@@ -131,6 +147,41 @@ fn unheeded(recorded: &Recorded, hello: &Hello) -> BTreeSet<String> {
         }
     }
     given
+}
+
+/// Parameters are arguments there, those of files, too.
+fn unheeded_two<'a>(
+    planned: &NodeSpec,
+    argv: &[String],
+    value: impl Fn(&str) -> Option<&'a serde_json::Value>,
+) -> BTreeSet<String> {
+    // The stub has read it, and so has the node.
+    let parts = |argv: &[String]| arguments::parse(argv).unwrap_or_default();
+    let deployed = parts(&planned.argv);
+    let known = |name: &str, given: &str| {
+        let same = deployed.iter().rev().find_map(|part| match &part.kind {
+            Kind::Parameter(of) if of.name == name => Some(of.value == given),
+            _ => None,
+        });
+        // What is written so is JSON, too.
+        let is_it = || {
+            let given: Option<serde_json::Value> = serde_json::from_str(given).ok();
+            given.is_some() && given.as_ref() == value(name)
+        };
+        same.unwrap_or_else(is_it)
+    };
+    let given = parts(argv).into_iter().filter_map(|part| match part.kind {
+        Kind::Parameter(of) => {
+            (!known(&of.name, &of.value)).then(|| format!("the parameter {}", of.name))
+        }
+        Kind::Own | Kind::Setting => {
+            let words = part.words.join(" ");
+            let same = deployed.iter().any(|other| other.words == part.words);
+            (!same).then(|| format!("the argument {words:?}"))
+        }
+        Kind::Mark | Kind::Rule(_) | Kind::File(_) => None,
+    });
+    given.collect()
 }
 
 /// The parameters below a node's name.
@@ -221,7 +272,9 @@ impl Nodes for SharedNodes {
     }
 
     fn unheeded(&self, hello: &Hello) -> Option<String> {
-        let given: Vec<String> = unheeded(&self.recorded, hello).into_iter().collect();
+        let value = |name: &str| self.bus.value(name);
+        let given = unheeded(&self.recorded, hello, value);
+        let given: Vec<String> = given.into_iter().collect();
         (!given.is_empty()).then(|| {
             format!(
                 "robots share service {}, whose nodes have their parameters and arguments from its push: what this robot gives {} is not heeded ({}); have it given when the service is pushed (--param), or push it without --shared",
@@ -240,6 +293,7 @@ impl Nodes for SharedNodes {
 #[cfg(test)]
 mod tests {
     use package::inventory::Inventory;
+    use ros::flavour::Version;
 
     use super::*;
 
@@ -325,8 +379,48 @@ mod tests {
                     .collect(),
                 ..Hello::default()
             };
-            let given: Vec<String> = unheeded(&recorded(&[COOK]), &hello).into_iter().collect();
+            let recorded = recorded(&[COOK]);
+            let given = unheeded(&recorded, &hello, |_| None);
+            let given: Vec<String> = given.into_iter().collect();
             assert_eq!(given, expected, "{hello:?}");
+        }
+    }
+
+    #[test]
+    fn what_a_robot_of_ros_2_gives_in_vain_is_named() {
+        let words =
+            |line: &str| -> Vec<String> { line.split_whitespace().map(str::to_owned).collect() };
+        let mut recorded = recorded(&[COOK]);
+        recorded.flavour.ros = Version::Ros2;
+        let deployed = "--ros-args -r __node:=cook -p salt:=3 -p oil:=1 -p oil:=2 --";
+        recorded.nodes[0].argv = words(&format!("{} --slow {deployed}", COOK.1));
+        let value = serde_json::json!("hot");
+        let value = |name: &str| (name == "/cook/pan").then_some(&value);
+        for (line, expected) in [
+            ("--ros-args -r work:=plan -r __node:=chef", &[][..]),
+            ("--slow --ros-args -p salt:=3 -p oil:=2 --", &[]),
+            ("--ros-args -p pan:=\"hot\"", &[]),
+            ("--ros-args -p pan:=\"cold\"", &["the parameter pan"]),
+            ("--ros-args -p oil:=1", &["the parameter oil"]),
+            (
+                "--ros-args -p use_sim_time:=true",
+                &["the parameter use_sim_time"],
+            ),
+            ("--fast", &["the argument \"--fast\""]),
+            (
+                "--ros-args --log-level debug",
+                &["the argument \"--log-level debug\""],
+            ),
+        ] {
+            let hello = Hello {
+                node: Node {
+                    argv: words(line),
+                    ..node("/r1/chef", "cook")
+                },
+                ..Hello::default()
+            };
+            let given: Vec<String> = unheeded(&recorded, &hello, value).into_iter().collect();
+            assert_eq!(given, expected, "{line}");
         }
     }
 }

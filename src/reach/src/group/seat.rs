@@ -1,10 +1,11 @@
 //! A group as one robot's [`Reach`]: a bridge and a hub of links of its own, so that its clients share what there is for clients
 //! of one robot, and nothing with another's.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 use futures_util::FutureExt;
 use ros::bus::Bus;
+use tokio::sync::mpsc;
 
 use super::Group;
 use super::nodes::SharedNodes;
@@ -20,7 +21,8 @@ pub fn seat(
     observer: Arc<dyn Observer>,
 ) -> Arc<dyn Reach> {
     let registry = Arc::clone(&recorded.registry);
-    let (bus, linked) = group.buses(&registry, &options.budget);
+    let (notices, noticed) = mpsc::unbounded_channel();
+    let (bus, linked) = group.buses(&registry, &options.budget, &notices);
     let nodes = SharedNodes::new(Arc::clone(&linked), recorded, place, observer);
     let shown: Arc<dyn Bus> = bus.clone();
     let behind = Behind {
@@ -37,5 +39,19 @@ pub fn seat(
         components: None,
         keeps: Box::new(()),
     };
-    Arc::new(InProcess::new(behind, options))
+    let reach = Arc::new(InProcess::new(behind, options));
+    tokio::spawn(pass_on(noticed, Arc::downgrade(&reach)));
+    reach
+}
+
+/// Tells robots what they should know of, as long as they have this place.
+async fn pass_on(mut noticed: mpsc::UnboundedReceiver<(String, String)>, reach: Weak<InProcess>) {
+    while let Some((node, what)) = noticed.recv().await {
+        let Some(reach) = reach.upgrade() else {
+            return;
+        };
+        if !node.is_empty() {
+            reach.report(&node, &what);
+        }
+    }
 }

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use package::interface::Interface;
-use ros::bus::{ActionNodes, Graph, TopicNodes};
+use ros::bus::{ActionNodes, Graph, RosVersion, TopicNodes};
 
-use super::action_topics::{End, topics_of};
-use super::names::Names;
+use super::action_ends::{End, ends_of};
+use super::names::{Names, What};
 
 /// The name of a node that the interface does not tell.
 const SOMEBODY: &str = "/shared";
@@ -32,7 +32,7 @@ pub(super) struct Shown {
 pub(super) struct ShownAction {
     pub(super) shown: Shown,
     pub(super) type_name: String,
-    pub(super) topics: Vec<(End, String)>,
+    pub(super) ends: Vec<(End, String)>,
 }
 
 /// A node of the group under the name that a robot's stub has for it.
@@ -49,7 +49,7 @@ pub(super) struct Alias<'a> {
 
 impl View {
     /// All of an interface, as it was deployed.
-    pub(super) fn whole(interface: &Interface) -> View {
+    pub(super) fn whole(version: RosVersion, interface: &Interface) -> View {
         let named = |node: &str| match node {
             "" => SOMEBODY.to_owned(),
             node => node.to_owned(),
@@ -68,7 +68,7 @@ impl View {
                     node: named(&action.node),
                 },
                 type_name: action.type_name.clone(),
-                topics: topics_of(&action.name).collect(),
+                ends: ends_of(version, &action.name),
             };
             (action.name.clone(), shown)
         });
@@ -79,7 +79,7 @@ impl View {
     }
 
     /// What one of its nodes serves, under the names that it would have on the robot.
-    pub(super) fn of_node(interface: &Interface, alias: &Alias<'_>) -> View {
+    pub(super) fn of_node(version: RosVersion, interface: &Interface, alias: &Alias<'_>) -> View {
         let Alias {
             deployed, robot, ..
         } = alias;
@@ -97,16 +97,21 @@ impl View {
             });
         let actions = interface.actions.iter();
         let actions = actions.filter(|action| its(&action.node)).map(|action| {
-            let topics = topics_of(&action.name).map(|(end, topic)| {
-                let suffix = &topic[action.name.len()..];
-                (end, deployed.topic_on(robot, &action.name, suffix))
+            let ends = ends_of(version, &action.name).into_iter();
+            let ends = ends.map(|(end, name)| {
+                let suffix = &name[action.name.len()..];
+                let what = match end.is_service() {
+                    true => What::Service,
+                    false => What::Topic,
+                };
+                (end, deployed.end_on(robot, &action.name, suffix, what))
             });
             let shown = ShownAction {
                 shown: shown(&action.name),
                 type_name: action.type_name.clone(),
-                topics: topics.collect(),
+                ends: ends.collect(),
             };
-            (deployed.on(robot, &action.name), shown)
+            (deployed.action_on(robot, &action.name), shown)
         });
         View {
             services: services.collect(),
@@ -120,33 +125,49 @@ impl View {
         self.actions.extend(other.actions);
     }
 
-    /// The action that a topic belongs to, and which of its topics that is.
-    pub(super) fn action_of(&self, topic: &str) -> Option<(&ShownAction, End)> {
+    /// The action that a topic belongs to, and which of its parts that is.
+    pub(super) fn topic(&self, name: &str) -> Option<(&ShownAction, End)> {
+        self.part(name).filter(|(_, end)| !end.is_service())
+    }
+
+    /// The action that a service belongs to, and which of its parts that is.
+    pub(super) fn action_service(&self, name: &str) -> Option<(&ShownAction, End)> {
+        self.part(name).filter(|(_, end)| end.is_service())
+    }
+
+    fn part(&self, name: &str) -> Option<(&ShownAction, End)> {
         self.actions.values().find_map(|action| {
-            let mut topics = action.topics.iter();
-            let (end, _) = topics.find(|(_, name)| name == topic)?;
+            let mut ends = action.ends.iter();
+            let (end, _) = ends.find(|(_, part)| part == name)?;
             Some((action, *end))
         })
     }
 
-    /// As a graph.
-    pub(super) fn graph(&self, generation: u64) -> Graph {
+    /// As a graph; of ROS 2 without what each node has, which its types are needed for.
+    pub(super) fn graph(&self, version: RosVersion, generation: u64) -> Graph {
         let services = self.services.iter();
         let services: BTreeMap<String, String> = services
             .map(|(name, shown)| (name.clone(), shown.node.clone()))
             .collect();
+        // In ROS 2 they are no topics to who looks at the graph.
+        let topics_of = |action: &ShownAction| -> Vec<(End, String)> {
+            match version {
+                RosVersion::One => action.ends.clone(),
+                RosVersion::Two => Vec::new(),
+            }
+        };
         let actions = self.actions.iter().map(|(name, action)| {
-            let topics = action.topics.iter();
+            let topics = topics_of(action).into_iter();
             let nodes = ActionNodes {
                 type_name: action.type_name.clone(),
                 servers: vec![action.shown.node.clone()],
-                topics: topics.map(|(_, topic)| topic.clone()).collect(),
+                topics: topics.map(|(_, topic)| topic).collect(),
                 ..ActionNodes::default()
             };
             (name.clone(), nodes)
         });
         let topics = self.actions.values().flat_map(|action| {
-            action.topics.iter().map(|(end, topic)| {
+            topics_of(action).into_iter().map(|(end, topic)| {
                 let mut ends = TopicNodes {
                     type_name: end.type_name(&action.type_name),
                     ..TopicNodes::default()
@@ -156,7 +177,7 @@ impl View {
                     false => &mut ends.publishers,
                 };
                 here.push(action.shown.node.clone());
-                (topic.clone(), ends)
+                (topic, ends)
             })
         });
         let nodes = services

@@ -106,7 +106,7 @@ impl Known {
             Ok::<_, BusError>(task.abort_handle())
         });
         match begun.await {
-            Ok(_) | Err(BusError::NotOffered(_)) => {}
+            Ok(_) | Err(BusError::NotOffered(_) | BusError::NotShared(_)) => {}
             Err(error) => {
                 tracing::warn!(%error, "parameters that nodes set do not reach the robot");
             }
