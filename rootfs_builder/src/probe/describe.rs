@@ -130,7 +130,7 @@ pub(super) async fn describe(
     for need in &found.interface.needs {
         let (name, nodes) = (&need.name, need.nodes.join(", "));
         found.warnings.push(format!(
-            "{nodes} looks for the service {name}, which nobody serves here: on a robot it is looked for there"
+            "{nodes} looks for {name}, which nobody serves here: on a robot it is looked for there"
         ));
     }
     Ok(found)
@@ -151,9 +151,22 @@ pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
     needs.filter(|need| !need.nodes.is_empty()).collect()
 }
 
-/// Those, and the services that were lent.
+/// Those, actions that goals would be sent to (ROS 2, where no topics tell of them), and the services that were lent.
 fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
-    let mut needs = needs(&seen.graph, &seen.options.own_name);
+    let own_name = &seen.options.own_name;
+    let mut needs = needs(&seen.graph, own_name);
+    let actions = seen.graph.actions.iter();
+    let others = |nodes: &[String]| -> Vec<String> {
+        let nodes = nodes.iter().filter(|node| *node != own_name);
+        nodes.cloned().collect()
+    };
+    let sought =
+        actions.filter(|(_, ends)| ends.topics.is_empty() && others(&ends.servers).is_empty());
+    let sought = sought.map(|(name, ends)| Need {
+        name: name.clone(),
+        nodes: others(&ends.clients),
+    });
+    needs.extend(sought.filter(|need| !need.nodes.is_empty()));
     for (name, nodes) in &seen.asked {
         let server = seen.graph.services.get(name);
         if server.is_some_and(|node| *node != seen.options.own_name) {

@@ -22,7 +22,7 @@ pub struct Interface {
     /// Parameters, by name.
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub parameters: Vec<Parameter>,
-    /// ROS services that the package calls and does not serve, by name.
+    /// ROS services, and actions of ROS 2, that the package uses and does not serve, by name.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub needs: Vec<Need>,
@@ -32,7 +32,7 @@ pub struct Interface {
     pub lifecycle: Vec<String>,
 }
 
-/// A ROS service that a robot should serve.
+/// A ROS service, or an action of ROS 2, that a robot should serve.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Need {

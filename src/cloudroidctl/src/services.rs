@@ -100,7 +100,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.actions {
         actions.row([entry.name.clone(), entry.type_name.clone()]);
     }
-    let mut needs = Table::new(&["NEEDS SERVICE", "CALLED BY"]);
+    let mut needs = Table::new(&["NEEDS", "CALLED BY"]);
     for entry in &service.interface.needs {
         needs.row([entry.name.clone(), entry.nodes.join(", ")]);
     }

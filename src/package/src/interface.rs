@@ -26,7 +26,7 @@ pub struct Interface {
     pub actions: Vec<Action>,
     /// Parameters that a node read or wrote, or has of its own (ROS 2), by name.
     pub parameters: Vec<Parameter>,
-    /// Services that nodes of the package call and none of them serves, by name.
+    /// Services that nodes of the package call and none of them serves, by name; of ROS 2 actions, too.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<Need>,
     /// Nodes that have a lifecycle (ROS 2), by name; the services of it are not repeated in `services`.
@@ -104,7 +104,7 @@ pub struct Action {
     pub node: String,
 }
 
-/// A service that the package looks for on its robot. A lookup tells no type.
+/// A service, or of ROS 2 an action, that the package looks for on its robot. A lookup tells no type.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Need {
     /// Absolute name.

@@ -119,6 +119,8 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
         .serve("/see/get_parameters", two.service("lab/srv/Look"), zeros())
         .await;
     let _needs = node.seek("/where", two.service("lab/srv/Look"));
+    let turn = two.registry.action("lab/action/Turn").expect("defined");
+    let _turns = node.action_client("/turn", &turn).expect("a client");
     let set = [
         ("rate", 2.5.into()),
         ("use_sim_time", false.into()),
@@ -163,7 +165,7 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
         .iter()
         .map(|need| (&*need.name, need.nodes.len()))
         .collect();
-    assert_eq!(needs, [("/where", 1)]);
+    assert_eq!(needs, [("/turn", 1), ("/where", 1)]);
     let shown: Vec<_> = interface
         .parameters
         .iter()
