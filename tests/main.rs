@@ -532,8 +532,11 @@ fn main() -> ExitCode {
             an_answer_waits_for_one_big_message_at_most,
         ],
         stories![sharing:
-            twenty_robots_share_two_servants_and_one_of_these_is_killed,
             a_shared_service_grows_under_load_and_shrinks_after_it,
+            an_application_of_rclpy_shares_one_servant_with_another_robot,
+        ],
+        of_both![sharing:
+            twenty_robots_share_two_servants_and_one_of_these_is_killed,
             goals_of_robots_do_not_meet,
             what_robots_cannot_share_is_refused_with_what_was_found,
             of_two_replicas_the_first_answers_and_the_cost_is_shown,
