@@ -1,0 +1,110 @@
+//! Requests that come from elsewhere by way of this machine: those of other sites' pages, in the browser of a user of it, and those that a
+//! proxy passes on.
+
+use std::net::IpAddr;
+
+use axum::http::{HeaderMap, header};
+
+use super::header_text;
+use crate::errors::Error;
+
+/// Refuses what is addressed to another machine (DNS rebinding).
+pub(super) fn check_host(headers: &HeaderMap) -> Result<(), Error> {
+    let host = header_text(headers, header::HOST).unwrap_or_default();
+    if is_loopback_host(without_port(host)) {
+        return Ok(());
+    }
+    Err(Error::Foreign {
+        what: format!(
+            "the request is addressed to {host:?}, but this portal serves this machine alone"
+        ),
+        next: "use 127.0.0.1 or localhost, or configure tokens, as a proxy in front of it needs"
+            .to_owned(),
+    })
+}
+
+/// Refuses pages of other machines, but for those of origins that are allowed.
+pub(super) fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<(), Error> {
+    let Some(origin) = header_text(headers, header::ORIGIN) else {
+        return Ok(());
+    };
+    let of_this_machine = origin.split_once("://").is_some_and(|(scheme, host)| {
+        scheme.starts_with("http") && is_loopback_host(without_port(host))
+    });
+    if of_this_machine
+        || allowed
+            .iter()
+            .any(|allowed| allowed.trim_end_matches('/') == origin)
+    {
+        return Ok(());
+    }
+    Err(Error::Foreign {
+        what: format!("a page of {origin} may not use this portal"),
+        next: format!("if it should, add it to the configuration: origins = [{origin:?}]"),
+    })
+}
+
+/// Refuses what a page of another site loads as a part of itself (an image, a script, a frame): the browser keeps the answer
+/// from the page, but tells it whether there was one, and so what there is here. Browsers say where a request comes from (Fetch
+/// Metadata, W3C); those with an origin are decided by that, and a person who follows a link is answered.
+pub fn check_part(headers: &HeaderMap) -> Result<(), Error> {
+    let is = |name: &str, values: &[&str]| {
+        let said = headers.get(name).and_then(|value| value.to_str().ok());
+        said.is_some_and(|said| values.contains(&said))
+    };
+    let elsewhere = is("sec-fetch-site", &["cross-site", "same-site"]);
+    let follows = is("sec-fetch-mode", &["navigate"]) && is("sec-fetch-dest", &["document"]);
+    match elsewhere && !follows && !headers.contains_key(header::ORIGIN) {
+        true => Err(Error::Foreign {
+            what: "a page of another site may not have this portal's answers as parts of itself"
+                .to_owned(),
+            next: "open the address itself, or ask with a token (Authorization: Bearer TOKEN)"
+                .to_owned(),
+        }),
+        false => Ok(()),
+    }
+}
+
+/// Headers that proxies add.
+const FORWARDED: [&str; 6] = [
+    "forwarded",
+    "via",
+    "x-forwarded-for",
+    "x-forwarded-host",
+    "x-forwarded-proto",
+    "x-real-ip",
+];
+
+/// Refuses requests with a proxy's headers: their callers are on other machines, whatever `Host` says.
+pub(super) fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
+    match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
+        None => Ok(()),
+        Some(name) => Err(Error::Foreign {
+            what: format!(
+                "a proxy passes this request on (its header {name} says so), and this portal has no tokens by which to \
+                 tell who asks"
+            ),
+            next: "configure tokens, and send one: Authorization: Bearer TOKEN, or ?token=TOKEN"
+                .to_owned(),
+        }),
+    }
+}
+
+fn without_port(host: &str) -> &str {
+    match host.rsplit_once(':') {
+        Some((name, port))
+            if port.bytes().all(|byte| byte.is_ascii_digit()) && !name.ends_with(':') =>
+        {
+            name
+        }
+        _ => host,
+    }
+}
+
+fn is_loopback_host(host: &str) -> bool {
+    let bare = host.trim_start_matches('[').trim_end_matches(']');
+    host.eq_ignore_ascii_case("localhost")
+        || bare
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_loopback())
+}
