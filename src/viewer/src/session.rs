@@ -1,30 +1,31 @@
 //! One viewer's connection.
 
+mod calling;
+mod connections;
+mod publishing;
+mod subscribing;
+
 use std::collections::HashMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use access::Operation;
 use bridge::Granted;
 use budget::Budget;
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::Bytes;
+use foxglove::ws_protocol::JsonMessage;
 use foxglove::ws_protocol::client::{self, ClientMessage};
 use foxglove::ws_protocol::schema::Schema;
 use foxglove::ws_protocol::server::advertise::Channel;
 use foxglove::ws_protocol::server::advertise_services::Service;
-use foxglove::ws_protocol::server::connection_graph_update::{
-    AdvertisedService, PublishedTopic, SubscribedTopic,
-};
 use foxglove::ws_protocol::server::server_info::Capability;
 use foxglove::ws_protocol::server::{
-    Advertise, AdvertiseServices, ConnectionGraphUpdate, ParameterValues, ServerInfo,
-    ServiceCallFailure, ServiceCallResponse, Status, Unadvertise, UnadvertiseServices,
+    Advertise, AdvertiseServices, ParameterValues, ServerInfo, Status, Unadvertise,
+    UnadvertiseServices,
 };
-use foxglove::ws_protocol::{BinaryMessage, JsonMessage};
-use ros::bus::{Bus, Graph, Publisher, Qos, Subscription, WireType, reaches};
-use ros::codec;
-use ros::schema::{MessageType, Registry, ServiceDef};
+use ros::bus::{Bus, Graph, WireType};
+use ros::schema::{Registry, ServiceDef};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinError, JoinSet};
@@ -35,6 +36,8 @@ use crate::catalogue::Catalogue;
 use crate::format::Format;
 use crate::line::{Frame, Line, Read};
 use crate::parameters;
+use publishing::Published;
+use subscribing::Subscribed;
 
 /// Subprotocols that viewers ask for, the newest first. They are of one version: the older name is of the time before the protocol was
 /// part of the SDK.
@@ -46,23 +49,13 @@ const LARGEST_TEXT: usize = 1 << 20;
 const OUTGOING: usize = 16;
 /// Messages of a topic that may wait behind these, as the viewer asks; the newest win.
 pub const DEPTH: RangeInclusive<usize> = 2..=1000;
-/// Messages of a viewer's topic that wait for a slow node, at least.
-const PUBLISHED: usize = 10;
 /// For the connections of a topic's subscribers.
 const CONNECTS: Duration = Duration::from_secs(2);
-/// Between two words about messages that a topic's reader missed.
-const MISSED: Duration = Duration::from_secs(5);
-/// Of one viewer.
-const SUBSCRIPTIONS: usize = 512;
-const ADVERTISEMENTS: usize = 512;
-const CALLS: usize = 32;
 /// Bytes of a message from a viewer.
 const LARGEST: usize = 16 << 20;
 /// Close codes (RFC 6455): of a servant that ends, and of what is not allowed any more.
 const ENDED: u16 = 1012;
 const NOT_ALLOWED: u16 = 1008;
-/// For the answer to a call.
-const ANSWER: Duration = Duration::from_secs(60);
 
 /// How a viewer is served.
 pub struct ViewerOptions {
@@ -241,32 +234,6 @@ struct Session {
     /// What tasks tell.
     out: mpsc::Sender<Frame>,
     found: mpsc::Sender<Found>,
-}
-
-/// A topic that the viewer publishes.
-struct Published {
-    topic: String,
-    /// None where it was refused, which was told.
-    publishing: Option<Publishing>,
-}
-
-/// Where its messages go, and what they are.
-struct Publishing {
-    of: Arc<MessageType>,
-    messages: mpsc::Sender<Bytes>,
-}
-
-/// A subscription of the viewer's, until dropped.
-struct Subscribed {
-    channel: u64,
-    topic: String,
-    task: tokio::task::AbortHandle,
-}
-
-impl Drop for Subscribed {
-    fn drop(&mut self) {
-        self.task.abort();
-    }
 }
 
 impl Session {
@@ -464,201 +431,6 @@ impl Session {
         }
     }
 
-    fn subscribe(&mut self, id: u32, channel: u64) {
-        let Some((topic, of)) = self.catalogue.channel(channel).cloned() else {
-            return self.complain(format!("there is no channel {channel}"));
-        };
-        if self.subscriptions.contains_key(&id) {
-            return self.complain(format!("subscription {id} is there already"));
-        }
-        if self.subscriptions.len() >= SUBSCRIPTIONS {
-            let words = format!("{topic}: one viewer may have {SUBSCRIPTIONS} subscriptions");
-            return self.complain(words);
-        }
-        if let Err(refused) = self.granted.check(Operation::Subscribe, &topic) {
-            return self.complain(refused);
-        }
-        let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
-        let (listened, budget) = (topic.clone(), self.budget.clone());
-        let qos = Qos::keep_last(self.depth).latching(true);
-        let task = self.tasks.spawn(async move {
-            match bus.subscribe(&listened, WireType::clone(&of), qos).await {
-                Ok(subscription) => {
-                    let mut reader = Reader {
-                        id,
-                        topic: listened,
-                        budget,
-                        out,
-                        missed: 0,
-                        told: (0, Instant::now()),
-                    };
-                    reader.passes(subscription).await;
-                }
-                Err(error) => {
-                    let words = format!("{listened} cannot be subscribed to: {error}");
-                    let _ = out
-                        .send(Frame::Text(Status::error(words).to_string()))
-                        .await;
-                }
-            }
-            Ended::Other
-        });
-        let subscribed = Subscribed {
-            channel,
-            topic,
-            task,
-        };
-        self.subscriptions.insert(id, subscribed);
-    }
-
-    async fn publish(&mut self, id: u32, message: &[u8]) {
-        let Some(published) = self.publishers.get(&id) else {
-            let words = format!("channel {id} is not advertised by this viewer");
-            return self.complain(words);
-        };
-        let Some(Publishing { of, messages }) = &published.publishing else {
-            return;
-        };
-        if let Err(error) = codec::validate(of, message) {
-            let words = format!("{}: this is no {}: {error}", published.topic, of.name());
-            return self.complain(words);
-        }
-        match self.budget.take(message.len()) {
-            // It is taken for as long as the sender is there.
-            Ok(permit) => drop(messages.send(permit.around(message.to_vec())).await),
-            Err(exceeded) => {
-                self.complain(format!("{}: {exceeded}", published.topic));
-            }
-        }
-    }
-
-    async fn advertise(&mut self, channel: client::advertise::Channel<'_>) {
-        let id = channel.id;
-        if self.publishers.contains_key(&id) {
-            return self.complain(format!("channel {id} is there already"));
-        }
-        let topic = channel.topic.clone().into_owned();
-        if self.publishers.len() >= ADVERTISEMENTS {
-            let words = format!("{topic}: one viewer may advertise {ADVERTISEMENTS} topics");
-            return self.complain(words);
-        }
-        let publishing = match self.publisher(&topic, &channel).await {
-            Ok((of, publisher)) => Some(Publishing {
-                of,
-                messages: self.publishing(&topic, publisher),
-            }),
-            Err(words) => {
-                self.complain(words);
-                None
-            }
-        };
-        self.publishers.insert(id, Published { topic, publishing });
-    }
-
-    async fn publisher(
-        &self,
-        topic: &str,
-        channel: &client::advertise::Channel<'_>,
-    ) -> Result<(Arc<MessageType>, Box<dyn Publisher>), String> {
-        let encoding = self.format.encoding;
-        if channel.encoding != encoding {
-            return Err(format!(
-                "{topic}: messages are to be written as {encoding}, not {}",
-                channel.encoding
-            ));
-        }
-        self.granted.check(Operation::Publish, topic)?;
-        let message = self.registry.message(&channel.schema_name);
-        let message = message.map_err(|error| format!("{topic}: {error}"))?;
-        let qos = Qos::keep_last(self.depth.max(PUBLISHED));
-        let publisher = self.bus.advertise(topic, WireType::of(&message), qos).await;
-        let publisher =
-            publisher.map_err(|error| format!("{topic} cannot be advertised: {error}"))?;
-        Ok((message, publisher))
-    }
-
-    /// Publishes what is sent, once all are connected who are there.
-    fn publishing(&mut self, topic: &str, publisher: Box<dyn Publisher>) -> mpsc::Sender<Bytes> {
-        let (messages, mut waiting) = mpsc::channel::<Bytes>(OUTGOING);
-        let graph = self.bus.graph();
-        let listening = graph.borrow().topics.get(topic).map_or(0, |ends| {
-            let others = ends.subscribers.iter();
-            others.filter(|node| **node != self.bus.node()).count()
-        });
-        self.tasks.spawn(async move {
-            // Viewers publish right behind what they advertise.
-            let _ = timeout(CONNECTS, reaches(publisher.matched(), listening)).await;
-            while let Some(message) = waiting.recv().await {
-                publisher.publish(message);
-            }
-            Ended::Published
-        });
-        self.publishing += 1;
-        messages
-    }
-
-    async fn call(&mut self, call: client::ServiceCallRequest<'_>) {
-        let (service_id, call_id) = (call.service_id, call.call_id);
-        let (service, of) = match self.may_call(&call) {
-            Ok(found) => found,
-            Err(words) => {
-                let failure = ServiceCallFailure::new(service_id, call_id, words);
-                return self.tell(&failure);
-            }
-        };
-        self.calls += 1;
-        let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
-        let encoding = self.format.encoding;
-        let request = Bytes::copy_from_slice(&call.payload);
-        self.tasks.spawn(async move {
-            let digest = of.md5.as_str().into();
-            let answered = bus.call_typed(&service, &digest, request, ANSWER).await;
-            let message = match answered {
-                Ok(answer) => {
-                    let response = ServiceCallResponse {
-                        service_id,
-                        call_id,
-                        encoding: encoding.into(),
-                        payload: (&answer[..]).into(),
-                    };
-                    Frame::Binary(response.to_bytes().into())
-                }
-                Err(error) => {
-                    let words = format!("{service}: {error}");
-                    let failure = ServiceCallFailure::new(service_id, call_id, words);
-                    Frame::Text(failure.to_string())
-                }
-            };
-            let _ = out.send(message).await;
-            Ended::Call
-        });
-    }
-
-    fn may_call(
-        &self,
-        call: &client::ServiceCallRequest<'_>,
-    ) -> Result<(String, Arc<ServiceDef>), String> {
-        let found = self.catalogue.service(call.service_id);
-        let (service, of) =
-            found.ok_or_else(|| format!("there is no service {}", call.service_id))?;
-        let encoding = self.format.encoding;
-        if call.encoding != encoding {
-            return Err(format!(
-                "{service}: requests are to be written as {encoding}, not {}",
-                call.encoding
-            ));
-        }
-        if self.calls >= CALLS {
-            return Err(format!(
-                "{service}: one viewer may have {CALLS} calls under way"
-            ));
-        }
-        self.granted.check(Operation::Call, service)?;
-        codec::validate(&of.request, &call.payload)
-            .map_err(|error| format!("{service}: this is no request of {}: {error}", of.name))?;
-        Ok((service.clone(), Arc::clone(of)))
-    }
-
     /// All of them where none is named.
     async fn tell_parameters(&mut self, names: Vec<String>, id: Option<String>) {
         match parameters::all(&*self.bus, names).await {
@@ -689,100 +461,4 @@ impl Session {
             self.tell_parameters(names, wanted.id).await;
         }
     }
-
-    /// Tells what of the graph's connections has changed, where the viewer wants to know.
-    fn show_graph(&mut self, now: &Arc<Graph>) {
-        let Some(before) = self.shows_graph.replace(Arc::clone(now)) else {
-            self.shows_graph = None;
-            return;
-        };
-        let mut update = ConnectionGraphUpdate::default();
-        for (name, topic) in &now.topics {
-            let earlier = before.topics.get(name);
-            if earlier.map(|earlier| &earlier.publishers) != Some(&topic.publishers) {
-                let publishers = topic.publishers.iter();
-                update
-                    .published_topics
-                    .push(PublishedTopic::new(name, publishers));
-            }
-            if earlier.map(|earlier| &earlier.subscribers) != Some(&topic.subscribers) {
-                let subscribers = topic.subscribers.iter();
-                update
-                    .subscribed_topics
-                    .push(SubscribedTopic::new(name, subscribers));
-            }
-        }
-        for (name, node) in &now.services {
-            if before.services.get(name) != Some(node) {
-                update
-                    .advertised_services
-                    .push(AdvertisedService::new(name, [node]));
-            }
-        }
-        let gone = before
-            .topics
-            .keys()
-            .filter(|name| !now.topics.contains_key(*name));
-        update.removed_topics = gone.cloned().collect();
-        let gone = before
-            .services
-            .keys()
-            .filter(|name| !now.services.contains_key(*name));
-        update.removed_services = gone.cloned().collect();
-        if update != ConnectionGraphUpdate::default() {
-            self.tell(&update);
-        }
-    }
-}
-
-/// One topic on its way to the viewer.
-struct Reader {
-    id: u32,
-    topic: String,
-    budget: Budget,
-    out: mpsc::Sender<Frame>,
-    /// Messages for which there was no room in the budget.
-    missed: u64,
-    /// How many it was told to have missed, and when.
-    told: (u64, Instant),
-}
-
-impl Reader {
-    /// Passes messages on, each when the viewer has taken those before.
-    async fn passes(&mut self, mut subscription: Subscription) {
-        while let Some(message) = subscription.messages.recv().await {
-            let now = SystemTime::now().duration_since(UNIX_EPOCH);
-            let now = now.map_or(0, |since| since.as_nanos() as u64);
-            let Ok(permit) = self.budget.take(message.bytes.len()) else {
-                self.missed += 1;
-                continue;
-            };
-            let frame = permit.around(framed(self.id, now, &message.bytes));
-            if self.out.send(Frame::Binary(frame)).await.is_err() {
-                return;
-            }
-            let missed = self.missed + subscription.dropped.get();
-            let (told, at) = self.told;
-            if missed > told && (told == 0 || at.elapsed() >= MISSED) {
-                self.told = (missed, Instant::now());
-                let words = format!(
-                    "{}: {missed} messages were left out, since they come faster than they are read",
-                    self.topic
-                );
-                let status = Frame::Text(Status::warning(words).to_string());
-                let _ = self.out.send(status).await;
-            }
-        }
-    }
-}
-
-fn framed(id: u32, time: u64, message: &[u8]) -> BytesMut {
-    // The operation's code in the protocol.
-    const MESSAGE_DATA: u8 = 1;
-    let mut frame = BytesMut::with_capacity(13 + message.len());
-    frame.put_u8(MESSAGE_DATA);
-    frame.put_u32_le(id);
-    frame.put_u64_le(time);
-    frame.extend_from_slice(message);
-    frame
 }
