@@ -4,11 +4,16 @@
 mod acme;
 mod archives;
 mod black_box;
+mod capacity;
 mod class;
 mod doubts;
+mod memory;
 mod oidc;
 mod options;
 mod people;
+mod portal;
+mod push;
+mod servant;
 mod time;
 mod tls;
 mod words;
@@ -18,21 +23,25 @@ use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
+use ::portal::{Proxies, Tokens};
+use ::servant::local::grants::Allow;
 use anyhow::{Context, anyhow, bail};
 use api::{Limits, Size};
 use choreographer::limits::check as check_limits;
-use portal::{Proxies, Tokens};
 use serde::Deserialize;
-use servant::local::grants::Allow;
-use servant::quotas::Quotas;
 
 use crate::machine;
 
 pub use self::oidc::Oidc;
+pub use self::portal::{NonFinite, Portal};
+pub use self::push::Push;
+pub use self::servant::{Hung, Servant};
 pub use acme::Acme;
 pub use archives::Archives;
 pub use black_box::BlackBox;
+pub use capacity::{Capacity, Controller};
 pub use class::Class;
+pub use memory::Memory;
 pub use people::People;
 pub use time::Time;
 pub use tls::Tls;
@@ -114,164 +123,6 @@ impl fmt::Display for IsolationMode {
     }
 }
 
-/// What of this machine may be promised to servants.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Capacity {
-    /// Cores to promise; all of the machine's by default.
-    pub cpus: Option<f64>,
-    /// How often each core may be promised, on the average. Memory is promised once.
-    pub overcommit: f64,
-    /// Whether cores are moved between servants while they work.
-    pub controller: Controller,
-    /// Memory to promise; nine tenths of the machine's by default.
-    pub memory: Option<Size>,
-    /// Robots that may wait for capacity.
-    pub queue: usize,
-    /// How long each may wait.
-    pub deadline: Time,
-}
-
-/// Whether the controller works.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Controller {
-    /// Those near what their robots accept at most get what others do not need.
-    On,
-    /// Limits stay as they were asked for.
-    Off,
-}
-
-/// The life of a servant.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Servant {
-    /// Cores promised to a servant whose push asked for none.
-    pub reserve_cpus: f64,
-    /// Memory promised to a servant whose push asked for none.
-    pub reserve_memory: Size,
-    /// How long a servant may take from its request to ready.
-    pub start: Time,
-    /// How long a robot's servant is kept after its last connection.
-    pub grace: Time,
-    /// The same for connections that named no robot.
-    pub anonymous_grace: Time,
-    /// Most services, those used last, that have containers made before a robot asks; how many each has is decided from the
-    /// robots that come.
-    #[serde(alias = "spares")]
-    pub warm_pool: usize,
-    /// Memory that all of those may take.
-    pub warm_memory: Size,
-    /// Most of them in which the nodes run, too.
-    pub warm_nodes: usize,
-    /// What is done about nodes that are given inputs and answer none.
-    pub hung: Hung,
-    /// They hang that answer nothing for so many times the T_max that their robot stated.
-    pub hung_after: f64,
-    /// Bytes of each file system that a servant writes; half of its memory by default.
-    pub scratch: Option<Size>,
-    /// Files, directories and links in each of them.
-    pub inodes: u64,
-    /// Bytes a second of its log, on the average.
-    pub log_rate: Size,
-}
-
-/// What is done about nodes that hang.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Hung {
-    /// Hung nodes are left alone, and no event says so.
-    Ignore,
-    /// An event says so.
-    Report,
-    /// An event says so, and the nodes are started again.
-    Restart,
-}
-
-/// What JSON has no word for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum NonFinite {
-    /// `null`, which every parser accepts.
-    Null,
-    /// `"NaN"`, `"Infinity"`, `"-Infinity"`.
-    Text,
-    /// `NaN`, `Infinity`, `-Infinity`: Python's words, refused by strict parsers.
-    Bare,
-}
-
-/// What clients may do to the port.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Portal {
-    /// Biggest WebSocket message, its frames together.
-    pub max_message: Size,
-    /// Biggest WebSocket frame.
-    pub max_frame: Size,
-    /// Time between pings; 0: none are sent.
-    pub ping: Time,
-    /// A connection from which nothing came for so long, not even a pong, is closed; 0: never.
-    pub idle: Time,
-    /// Bytes of JSON or CBOR that one message of a servant may become; a bigger one is not sent.
-    pub max_encoded: Size,
-    /// How NaN and infinities are written in JSON.
-    pub non_finite: NonFinite,
-    /// How long a request's header may take, and the `auth` message where one is awaited.
-    pub handshake: Time,
-    /// How long connections may take to end when the daemon ends.
-    pub drain: Time,
-}
-
-/// Limits of memory outside of servants' containers: in the daemon, and in shims.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Memory {
-    /// All clients and servants together, in the daemon; by default a quarter of the machine's memory, at most 1G.
-    pub daemon: Option<Size>,
-    /// One client: its unfinished messages, and bodies of its requests.
-    pub client: Size,
-    /// One servant: unfinished messages of its nodes and links, and JSON or CBOR made of its messages.
-    pub servant: Size,
-    /// Time from the first byte of a message, frame or body to its last.
-    pub unfinished: Time,
-    /// Memory of one servant's shim, in a cgroup of its own.
-    pub shim: Size,
-    /// Cores of one servant's shim; limited to its servant's, but never to less than 0.1.
-    pub shim_cpus: f64,
-}
-
-/// How big pushes may be, and what building them may take.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Push {
-    /// Bytes of the archive as sent.
-    pub archive: Size,
-    /// Bytes of the files in it, unpacked.
-    pub unpacked: Size,
-    /// How many files the archive may have.
-    pub entries: u64,
-    /// How long the nodes may take to show their interface.
-    pub probe: Time,
-    /// How long the archive may pause while it is sent.
-    pub stall: Time,
-    /// Bytes of the archive that must come in a second, on the average over times of `stall`; 0 for any.
-    pub min_rate: Size,
-    /// Pushes that are built at once; others wait.
-    pub at_once: usize,
-    /// Pushes that may wait.
-    pub queue: usize,
-    /// Time from the start of a push's build (after waiting) to its end.
-    pub time: Time,
-    /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
-    pub disk: Size,
-    /// Cores of each container of a build; as many as servants leave when not set.
-    pub cpus: Option<f64>,
-    /// Memory of each; half of the machine's when not set.
-    pub memory: Option<Size>,
-    /// Processes and threads of each.
-    pub pids: u64,
-}
-
 impl Default for Config {
     fn default() -> Self {
         Config {
@@ -307,129 +158,6 @@ impl Default for Config {
             push: Push::default(),
             allow: Allow::default(),
         }
-    }
-}
-
-impl Default for Capacity {
-    fn default() -> Self {
-        Capacity {
-            cpus: None,
-            overcommit: 1.0,
-            controller: Controller::On,
-            memory: None,
-            queue: 64,
-            deadline: Time::seconds(10),
-        }
-    }
-}
-
-impl Default for Servant {
-    fn default() -> Self {
-        Servant {
-            reserve_cpus: 0.01,
-            reserve_memory: Size(64 << 20),
-            start: Time::seconds(30),
-            grace: Time::seconds(60),
-            anonymous_grace: Time::seconds(0),
-            warm_pool: 8,
-            warm_memory: Size(1 << 30),
-            warm_nodes: 0,
-            hung: Hung::Report,
-            hung_after: 10.0,
-            scratch: None,
-            inodes: Quotas::default().inodes,
-            log_rate: Size(Quotas::default().log_rate),
-        }
-    }
-}
-
-impl Default for Portal {
-    fn default() -> Self {
-        Portal {
-            max_message: Size(64 << 20),
-            max_frame: Size(64 << 20),
-            max_encoded: Size(64 << 20),
-            ping: Time::seconds(15),
-            idle: Time::seconds(90),
-            non_finite: NonFinite::Null,
-            handshake: Time::seconds(10),
-            drain: Time::seconds(10),
-        }
-    }
-}
-
-impl Default for Memory {
-    fn default() -> Self {
-        Memory {
-            daemon: None,
-            client: Size(256 << 20),
-            servant: Size(256 << 20),
-            unfinished: Time::seconds(300),
-            shim: Size(256 << 20),
-            shim_cpus: 0.5,
-        }
-    }
-}
-
-impl Default for Push {
-    fn default() -> Self {
-        Push {
-            archive: Size(2 << 30),
-            unpacked: Size(8 << 30),
-            entries: 500_000,
-            probe: Time::seconds(30),
-            stall: Time::seconds(60),
-            min_rate: Size(1 << 10),
-            at_once: 2,
-            queue: 16,
-            time: Time::seconds(2 * 3600),
-            disk: Size(20 << 30),
-            cpus: None,
-            memory: None,
-            pids: 4096,
-        }
-    }
-}
-
-impl Capacity {
-    /// Beyond this nobody has what was promised.
-    const MOST_OVERCOMMIT: f64 = 100.0;
-
-    fn check(&self) -> anyhow::Result<()> {
-        let most = Self::MOST_OVERCOMMIT;
-        if !(1.0..=most).contains(&self.overcommit) {
-            bail!(
-                "overcommit = {} is not between 1 and {most}; 1 promises each core once, 1.5 promises half of them twice",
-                self.overcommit
-            );
-        }
-        Ok(())
-    }
-
-    /// Cores that there are for servants.
-    pub fn cores(&self) -> f64 {
-        self.cpus.unwrap_or_else(machine::cores)
-    }
-}
-
-impl Push {
-    fn check(&self) -> anyhow::Result<()> {
-        if self.at_once == 0 {
-            bail!("at_once = 0 would let no push be built; write at least 1");
-        }
-        if self.disk.0 == 0 || self.time.0.is_zero() || self.stall.0.is_zero() {
-            bail!("a disk, time or stall of 0 would end every push");
-        }
-        let sent = [self.archive.0, self.unpacked.0, self.entries];
-        if sent.contains(&0) || self.probe.0.is_zero() {
-            bail!("an archive, unpacked, entries or probe of 0 would refuse every push");
-        }
-        Ok(check_limits(&Limits {
-            cpus: self.cpus,
-            memory: self.memory,
-            pids: Some(self.pids),
-            ..Limits::default()
-        })?)
     }
 }
 
@@ -483,27 +211,7 @@ impl Config {
             oidc.check().context("[oidc] of the configuration")?;
         }
         check_limits(&self.limits).context("[limits] of the configuration")?;
-        if !(self.servant.hung_after >= 1.0 && self.servant.hung_after <= 1e6) {
-            bail!(
-                "[servant] hung_after = {} in the configuration is no number of times; write one from 1 to 1000000, such as 10",
-                self.servant.hung_after
-            );
-        }
-        // To the kernel, none is no limit.
-        let Servant {
-            scratch,
-            inodes,
-            log_rate,
-            ..
-        } = self.servant;
-        if scratch.is_some_and(|scratch| scratch.0 < 1 << 20)
-            || inodes < 256
-            || log_rate.0 < 1 << 10
-        {
-            bail!(
-                "[servant] of the configuration: programs need a scratch of at least 1M, 256 inodes, and a log_rate of at least 1K"
-            );
-        }
+        self.servant.check()?;
         for (name, class) in &self.class {
             class
                 .check(name)
@@ -530,29 +238,12 @@ impl Config {
         self.memory
             .check()
             .context("[memory] of the configuration")?;
-        if self.portal.max_encoded.0 == 0
-            || self.portal.max_message.0 == 0
-            || self.portal.max_frame.0 == 0
-        {
-            bail!(
-                "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
-            );
-        }
-        for (key, time, right) in [
-            ("[portal] handshake", self.portal.handshake, "10s"),
-            ("[servant] start", self.servant.start, "30s"),
-        ] {
-            if time.0.is_zero() {
-                bail!(
-                    "{key} = 0 in the configuration would give up before anything has begun; write a time such as \"{right}\""
-                );
-            }
-        }
+        self.portal.check()?;
         Ok(())
     }
 
     /// The proxies that are believed.
-    pub fn proxies(&self) -> Result<Proxies, portal::NoNetwork> {
+    pub fn proxies(&self) -> Result<Proxies, ::portal::NoNetwork> {
         let networks = self.trusted_proxies.iter().map(|written| written.parse());
         Ok(Proxies(networks.collect::<Result<_, _>>()?))
     }
@@ -564,34 +255,14 @@ impl Config {
     }
 }
 
-impl Memory {
-    /// Bytes below which nothing works.
-    const LEAST: u64 = 1 << 20;
-    const LEAST_FOR_A_SHIM: u64 = 32 << 20;
-
-    fn check(&self) -> anyhow::Result<()> {
-        let daemon = ("daemon", self.daemon.unwrap_or(self.client), Self::LEAST);
-        let least = Self::LEAST_FOR_A_SHIM;
-        for (name, size, least) in [
-            daemon,
-            ("client", self.client, Self::LEAST),
-            ("servant", self.servant, Self::LEAST),
-            ("shim", self.shim, least),
-        ] {
-            if size.0 < least {
-                bail!("{name} = {size} is too little; at least {}", Size(least));
-            }
-        }
-        if self.unfinished.0.is_zero() {
-            bail!(
-                "unfinished = 0 would refuse whatever does not come at once; write a time such as \"5m\""
-            );
-        }
-        if !(self.shim_cpus.is_finite() && (0.1..=64.0).contains(&self.shim_cpus)) {
-            bail!("shim_cpus = {} is not between 0.1 and 64", self.shim_cpus);
-        }
-        Ok(())
+/// Refuses a time in which nothing can begin; `right` is one in which it can.
+fn begins(key: &str, time: Time, right: &str) -> anyhow::Result<()> {
+    if time.0.is_zero() {
+        bail!(
+            "{key} = 0 in the configuration would give up before anything has begun; write a time such as \"{right}\""
+        );
     }
+    Ok(())
 }
 
 #[cfg(test)]
