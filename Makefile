@@ -115,7 +115,11 @@ demo: demo-ros demo-deps build-demo ## push Debian's people_detect and find peop
 
 .PHONY: test
 test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took
-	@scripts/parts test-deps lint unit stories test-eval test-vm
+	@scripts/parts room test-deps lint unit stories test-eval test-vm
+
+.PHONY: room
+room:
+	@scripts/room 30 15
 
 .PHONY: lint
 lint:
