@@ -52,6 +52,8 @@ mod eval;
 mod failover;
 #[path = "stories/fallback.rs"]
 mod fallback;
+#[path = "stories/goals.rs"]
+mod goals;
 #[path = "stories/grants.rs"]
 mod grants;
 #[path = "stories/history.rs"]
@@ -348,13 +350,17 @@ fn main() -> ExitCode {
             rosrun_gives_the_node_the_name_that_the_original_has,
             a_launch_file_says_what_is_promised,
         ],
-        stories![crossing:
+        of_both![crossing:
             stamps_mean_the_same_where_clocks_differ,
             simulated_time_is_the_robot_s,
             transforms_of_all_publishers_arrive,
+            explain_names_a_clock_and_a_queue,
+        ],
+        of_both![goals:
             an_action_is_carried_out_in_the_cloud,
             an_action_is_carried_out_by_the_original_while_the_cloud_is_slow,
-            explain_names_a_clock_and_a_queue,
+        ],
+        stories![crossing:
             settings_are_changed_through_dynamic_reconfigure,
             pictures_are_made_smaller_where_the_link_is_slow,
         ],

@@ -1,28 +1,40 @@
-//! What crosses the link beside plain messages: time, transforms, actions, settings.
+//! What crosses the link beside plain messages: time, transforms, settings. Actions are told in [`crate::goals`].
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
+use bytes::Bytes;
 use ros::bus::{
-    Bus, GlobalParameters, Message, ParamValue, Publisher, Qos, Subscription, WireType,
+    Bus, GlobalParameters, Message, ParamValue, Publisher, Qos, RosVersion, Subscription, WireType,
 };
 use ros::ros1::Ros1Bus;
 use ros::schema::{MessageType, Registry};
 use support::Verdict;
 use support::cable::{Badness, Cable};
+use support::layout::Layout;
 use support::robot::PATIENCE;
+use support::ros_system::Node;
 use support::site::{Running, Site};
-use support::world::{CROSSING, PEOPLE, world};
+use support::world::{CROSSING, CROSSING_TWO, PEOPLE, Service, world};
 
 const NODE: &str = "/crossing";
-const HOUR: i64 = 3600;
+/// In seconds.
+pub const HOUR: i64 = 3600;
 
 /// The definitions of what is published here.
 pub fn types() -> anyhow::Result<Registry> {
-    let registry = Registry::new();
+    types_of(RosVersion::One)
+}
+
+/// The same of either ROS.
+pub fn types_of(ros: RosVersion) -> anyhow::Result<Registry> {
+    let registry = Registry::of(ros);
     for (key, text) in [
-        ("geometry_msgs/PointStamped", "Header header\nPoint point"),
+        (
+            "geometry_msgs/PointStamped",
+            "std_msgs/Header header\nPoint point",
+        ),
         ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z"),
         (
             "tf2_msgs/TFMessage",
@@ -30,7 +42,7 @@ pub fn types() -> anyhow::Result<Registry> {
         ),
         (
             "geometry_msgs/TransformStamped",
-            "Header header\nstring child_frame_id\nTransform transform",
+            "std_msgs/Header header\nstring child_frame_id\nTransform transform",
         ),
         (
             "geometry_msgs/Transform",
@@ -41,29 +53,55 @@ pub fn types() -> anyhow::Result<Registry> {
             "geometry_msgs/Quaternion",
             "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
         ),
-        ("rosgraph_msgs/Clock", "time clock"),
         (
             "sensor_msgs/Image",
-            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
-        ),
-        (
-            "actionlib/action/Test",
-            "int32 goal\n---\nint32 result\n---\nint32 feedback",
+            "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
         ),
     ] {
-        registry.insert(key, text)?;
+        registry.insert(&named(ros, key), text)?;
     }
+    let (time, action, text) = match ros {
+        RosVersion::One => ("time", "actionlib/action/Test", ["int32"; 3]),
+        RosVersion::Two => (
+            "builtin_interfaces/Time",
+            "test_msgs/action/Fibonacci",
+            ["int32", "int32[]", "int32[]"],
+        ),
+    };
+    registry.insert(&named(ros, "rosgraph_msgs/Clock"), &format!("{time} clock"))?;
+    let names = match ros {
+        RosVersion::One => ["goal", "result", "feedback"],
+        RosVersion::Two => ["order", "sequence", "sequence"],
+    };
+    let parts = text
+        .iter()
+        .zip(names)
+        .map(|(of, name)| format!("{of} {name}\n"));
+    registry.insert(action, &parts.collect::<Vec<_>>().join("---\n"))?;
     Ok(registry)
+}
+
+/// A type's name in this ROS.
+fn named(ros: RosVersion, name: &str) -> String {
+    match ros {
+        RosVersion::One => name.to_owned(),
+        RosVersion::Two => name.replacen('/', "/msg/", 1),
+    }
+}
+
+/// The type of this name.
+fn of(ros: RosVersion, name: &str) -> anyhow::Result<Arc<MessageType>> {
+    Ok(types_of(ros)?.message(&named(ros, name))?)
 }
 
 pub fn advertises(
     site: &Site,
-    node: &Ros1Bus,
+    node: &(impl Node + ?Sized),
     topic: &str,
     of: &MessageType,
     latch: bool,
 ) -> anyhow::Result<Box<dyn Publisher>> {
-    Ok(site.runtime.block_on(node.advertise(
+    Ok(site.runtime.block_on(node.bus().advertise(
         topic,
         WireType::of(of),
         Qos::keep_last(10).latching(latch),
@@ -100,45 +138,102 @@ impl Written {
 }
 
 /// A geometry_msgs/PointStamped.
-fn point(at: i64) -> Vec<u8> {
-    Written::default().word(0).time(at).text("map").zeros(24).0
+fn point(ros: RosVersion, at: i64) -> Bytes {
+    let mut out = Layout::of(ros);
+    out.header_of(at, "map").f64(0.0).f64(0.0).f64(0.0).finish()
+}
+
+/// Whether they are the same, but for the first four bytes: what rospy fills in, or how CDR is written.
+fn is_same(one: &[u8], other: &[u8]) -> bool {
+    one.get(4..) == other.get(4..)
+}
+
+/// The text that a message ends with, behind so many bytes of flags.
+fn text_of(ros: RosVersion, message: &[u8], flags: usize) -> anyhow::Result<String> {
+    let at = match ros {
+        RosVersion::One => flags + 4,
+        RosVersion::Two => 4 + flags.next_multiple_of(4) + 4,
+    };
+    let text = message.get(at..).context("too short")?;
+    let text = String::from_utf8_lossy(text);
+    Ok(text.trim_end_matches('\0').to_owned())
 }
 
 /// What std_srvs/Trigger answered.
-fn triggers(site: &Site, app: &Ros1Bus, service: &str) -> anyhow::Result<String> {
-    let answer = site.calls(app, service, &[])?;
-    Ok(String::from_utf8_lossy(answer.get(5..).context("too short")?).into_owned())
+fn triggers(site: &Site, app: &Arc<dyn Bus>, service: &str) -> anyhow::Result<String> {
+    let ros = site.system.version();
+    let mut request = Layout::of(ros);
+    if ros == RosVersion::Two {
+        // An empty message is a byte.
+        request.u8(0);
+    }
+    let answer = site.calls(app, service, &request.finish())?;
+    text_of(ros, &answer, 1)
+}
+
+/// The service of the crossing node in this ROS, and its executable in the package of the same name.
+pub fn service(ros: RosVersion) -> (Service, &'static str) {
+    match ros {
+        RosVersion::One => (CROSSING, "crossing.py"),
+        RosVersion::Two => (CROSSING_TWO, "crossing"),
+    }
+}
+
+/// A robot's name in the story of this ROS.
+pub fn robot_of(ros: RosVersion, robot: &str) -> String {
+    format!("crossing-{robot}-{}", ros.number())
+}
+
+/// Its command line.
+pub fn argv(ros: RosVersion) -> &'static [&'static str] {
+    match ros {
+        RosVersion::One => &["__name:=crossing"],
+        RosVersion::Two => &[],
+    }
 }
 
 /// A stub of the crossing node, whose clock is `ahead` seconds ahead of the machine's.
-fn crossing(
+pub fn crossing(
     site: &Site,
     server: &str,
     robot: &str,
     ahead: i64,
     settings: &str,
 ) -> anyhow::Result<Running> {
+    let argv = argv(site.system.version());
+    crossing_with(site, (server, robot), ahead, settings, argv)
+}
+
+/// The same with a command line of one's own.
+fn crossing_with(
+    site: &Site,
+    (server, robot): (&str, &str),
+    ahead: i64,
+    settings: &str,
+    argv: &[&str],
+) -> anyhow::Result<Running> {
+    let (Service { name, .. }, executable) = service(site.system.version());
     let toml = format!(
-        "server = \"ws://{server}\"\nservice = \"crossing_py\"\nrobot = \"{robot}\"\nlocal = \"none\"\n{settings}\n"
+        "server = \"ws://{server}\"\nservice = \"{name}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n{settings}\n"
     );
     let ahead = ahead.to_string();
     let environment = [("CLOUDROID_TEST_CLOCK_SHIFT", ahead.as_str())];
-    site.stub_among(
-        &environment,
-        &toml,
-        "crossing_py",
-        "crossing.py",
-        &["__name:=crossing"],
-    )
+    site.stub_among(&environment, &toml, name, executable, argv)
 }
 
-fn is_there(site: &Site, app: &Ros1Bus) -> anyhow::Result<()> {
-    site.until(app, "the node", |graph| {
-        let publishes = |topic: &str| {
-            let ends = graph.topics.get(&format!("{NODE}/{topic}"));
-            ends.is_some_and(|ends| ends.publishers.iter().any(|node| node == NODE))
-        };
-        publishes("act/result") && graph.services.contains_key(&format!("{NODE}/ask"))
+/// Waits until the node has all that it makes.
+pub fn is_there(site: &Site, app: &(impl Node + ?Sized)) -> anyhow::Result<()> {
+    site.until(app, "the node", |graph| match site.system.version() {
+        RosVersion::One => {
+            let result = graph.topics.get(&format!("{NODE}/act/result"));
+            let publishes =
+                result.is_some_and(|ends| ends.publishers.iter().any(|node| node == NODE));
+            publishes && graph.services.contains_key(&format!("{NODE}/ask"))
+        }
+        RosVersion::Two => graph.ends.get(NODE).is_some_and(|ends| {
+            let serves = |name: &str| ends.services.contains_key(&format!("{NODE}/{name}"));
+            serves("now") && serves("act/_action/get_result") && serves("set_parameters")
+        }),
     })?;
     Ok(())
 }
@@ -166,8 +261,29 @@ pub fn answers(
     anyhow::bail!("there was no answer")
 }
 
+/// Publishes until this comes back as it was sent; others may come before it.
+fn comes_back(
+    site: &Site,
+    points: &dyn Publisher,
+    subscription: &mut Subscription,
+    sent: &Bytes,
+) -> Verdict {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let came = answers(site, || points.publish(sent.clone()), subscription)?;
+        if is_same(&came.bytes, sent) {
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "{came:?} is not {sent:?}");
+    }
+}
+
 /// Subscribes, and waits until the node's stub is connected.
-pub fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscription> {
+pub fn listens(
+    site: &Site,
+    app: &(impl Node + ?Sized),
+    topic: &str,
+) -> anyhow::Result<Subscription> {
     let mut subscription = site.hears(app, topic)?;
     let connected = site.runtime.block_on(async {
         let connected = subscription.matched.wait_for(|now| now.connected() > 0);
@@ -177,29 +293,32 @@ pub fn listens(site: &Site, app: &Ros1Bus, topic: &str) -> anyhow::Result<Subscr
     Ok(subscription)
 }
 
-pub fn stamps_mean_the_same_where_clocks_differ() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let stamped = types.message("geometry_msgs/PointStamped")?;
+pub fn stamps_mean_the_same_where_clocks_differ(ros: RosVersion) -> Verdict {
+    let daemon = world().with(service(ros).0)?;
+    let stamped = of(ros, "geometry_msgs/PointStamped")?;
     for (settings, understood) in [("", true), ("stamps = \"keep\"", false)] {
-        let site = Site::new()?;
-        let app = site.node("/app")?;
-        let robot = format!("crossing-clock-{understood}");
+        let site = Site::of(ros)?;
+        let app = site.joins("/app")?;
+        let robot = robot_of(ros, &format!("clock-{understood}"));
         let stub = crossing(&site, &daemon.address, &robot, HOUR, settings)?;
         with_log(is_there(&site, &app), &stub)?;
         let points = advertises(&site, &app, "/crossing/point", &stamped, false)?;
         site.connected(&*points, 1)?;
         let mut seen = site.hears(&app, "/crossing/seen")?;
         let mut refused = site.hears(&app, "/crossing/refused")?;
-        let sent = point(link::clock::now() + HOUR * 1_000_000_000 + 123);
-        let say = || points.publish(sent.clone().into());
+        let sent = point(ros, link::clock::now() + HOUR * 1_000_000_000 + 123);
+        let say = || points.publish(sent.clone());
         if understood {
             let answer = with_log(answers(&site, say, &mut seen), &stub)?;
-            // rospy fills in `seq`; all else, the stamp first, is as the robot sent it.
-            ensure!(answer.bytes[4..] == sent[4..], "{answer:?} is not {sent:?}");
+            // The stamp first of all is as the robot sent it.
+            ensure!(
+                is_same(&answer.bytes, &sent),
+                "{answer:?} is not {sent:?}\n{}",
+                stub.said()
+            );
         } else {
             let answer = with_log(answers(&site, say, &mut refused), &stub)?;
-            let answer = String::from_utf8_lossy(&answer.bytes).into_owned();
+            let answer = text_of(ros, &answer.bytes, 0)?;
             ensure!(
                 answer.contains("-3599.") || answer.contains("-3600."),
                 "{answer}"
@@ -209,20 +328,29 @@ pub fn stamps_mean_the_same_where_clocks_differ() -> Verdict {
     Ok(())
 }
 
-pub fn simulated_time_is_the_robot_s() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    site.runtime
-        .block_on(app.set("/use_sim_time", ParamValue::Bool(true)))?;
-    let clock = types.message("rosgraph_msgs/Clock")?;
+pub fn simulated_time_is_the_robot_s(ros: RosVersion) -> Verdict {
+    let daemon = world().with(service(ros).0)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    // In ROS 1 all nodes are told so, in ROS 2 each is.
+    if let Ok(parameters) = app.parameters() {
+        let simulated = parameters.set("/use_sim_time", ParamValue::Bool(true));
+        site.runtime.block_on(simulated)?;
+    }
+    let argv = match ros {
+        RosVersion::One => argv(ros),
+        RosVersion::Two => &["--ros-args", "-p", "use_sim_time:=true"],
+    };
+    let clock = of(ros, "rosgraph_msgs/Clock")?;
     let clock = advertises(&site, &app, "/clock", &clock, true)?;
-    let simulated = 1234 * 1_000_000_000 + 5;
-    clock.publish(Written::default().time(simulated).0.into());
-    let stub = crossing(&site, &daemon.address, "crossing-simulated", HOUR, "")?;
+    // More than the clocks differ, so that it could be shifted by that.
+    let simulated = 1_000_000 * 1_000_000_000 + 5;
+    let tick = || clock.publish(Layout::of(ros).time(simulated).finish());
+    tick();
+    let robot = robot_of(ros, "simulated");
+    let stub = crossing_with(&site, (&daemon.address, &robot), HOUR, "", argv)?;
     with_log(is_there(&site, &app), &stub)?;
-    let stamped = types.message("geometry_msgs/PointStamped")?;
+    let stamped = of(ros, "geometry_msgs/PointStamped")?;
     let points = advertises(&site, &app, "/crossing/point", &stamped, false)?;
     site.connected(&*points, 1)?;
     let mut seen = site.hears(&app, "/crossing/seen")?;
@@ -239,48 +367,64 @@ pub fn simulated_time_is_the_robot_s() -> Verdict {
             (Instant::now() < deadline).then_some(()).ok_or_else(late),
             &stub,
         )?;
-        clock.publish(Written::default().time(simulated).0.into());
+        tick();
     }
-    let say = || points.publish(point(simulated - 1).into());
+    let sent = point(ros, simulated - 1);
+    let say = || points.publish(sent.clone());
     let answer = with_log(answers(&site, say, &mut seen), &stub)?;
-    ensure!(answer.bytes[4..] == point(simulated - 1)[4..], "{answer:?}");
+    ensure!(is_same(&answer.bytes, &sent), "{answer:?} is not {sent:?}");
+    // A node of ROS 2 is told otherwise while it runs.
+    if let Ok(parameters) = app.node_parameters() {
+        for is_simulated in [false, true] {
+            let change = (
+                "use_sim_time".to_owned(),
+                Some(ParamValue::Bool(is_simulated)),
+            );
+            let set = site.runtime.block_on(parameters.set(NODE, vec![change]))?;
+            ensure!(set == [Ok(())], "{set:?}");
+            let sent = match is_simulated {
+                true => point(ros, simulated - 2),
+                false => point(ros, link::clock::now() + HOUR * 1_000_000_000 + 123),
+            };
+            tick();
+            with_log(comes_back(&site, &*points, &mut seen, &sent), &stub)?;
+        }
+    }
     Ok(())
 }
 
-pub fn transforms_of_all_publishers_arrive() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let transforms = types.message("tf2_msgs/TFMessage")?;
+pub fn transforms_of_all_publishers_arrive(ros: RosVersion) -> Verdict {
+    let daemon = world().with(service(ros).0)?;
+    let transforms = of(ros, "tf2_msgs/TFMessage")?;
     let transform = |child: &str| {
-        Written::default()
-            .word(1)
-            .word(0)
-            .time(link::clock::now())
-            .text("map")
-            .text(child)
-            .zeros(56)
-            .0
+        let mut out = Layout::of(ros);
+        out.u32(1).header_of(link::clock::now(), "map").text(child);
+        for _ in 0..7 {
+            out.f64(0.0);
+        }
+        out.finish()
     };
-    let site = Site::new()?;
+    let site = Site::of(ros)?;
     // Latched, by two publishers, before the stub is there.
     let mut fixed = Vec::new();
     for name in ["base", "laser"] {
-        let node = site.node(&format!("/{name}"))?;
+        let node = site.joins(&format!("/{name}"))?;
         let publisher = advertises(&site, &node, "/tf_static", &transforms, true)?;
-        publisher.publish(transform(name).into());
+        publisher.publish(transform(name));
         fixed.push((node, publisher));
     }
-    let app = site.node("/app")?;
+    let app = site.joins("/app")?;
     let moving = advertises(&site, &app, "/tf", &transforms, false)?;
-    let stub = crossing(&site, &daemon.address, "crossing-transforms", 0, "")?;
+    let robot = robot_of(ros, "transforms");
+    let stub = crossing(&site, &daemon.address, &robot, 0, "")?;
     with_log(is_there(&site, &app), &stub)?;
     site.connected(&*moving, 1)?;
-    let mut frames = site.hears(&app, "/crossing/frames")?;
-    moving.publish(transform("odometry").into());
+    let mut frames = site.hears_latched(&app, "/crossing/frames")?;
+    moving.publish(transform("odometry"));
     let wanted = "fixed:base fixed:laser moving:odometry";
     loop {
         let told = with_log(site.next(&mut frames), &stub)?;
-        let told = String::from_utf8_lossy(&told.bytes[4..]).into_owned();
+        let told = text_of(ros, &told.bytes, 0)?;
         if told == wanted {
             return Ok(());
         }
@@ -288,167 +432,12 @@ pub fn transforms_of_all_publishers_arrive() -> Verdict {
     }
 }
 
-pub fn an_action_is_carried_out_in_the_cloud() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let action = types.action("actionlib/Test")?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let stub = crossing(&site, &daemon.address, "crossing-action", HOUR, "")?;
-    with_log(is_there(&site, &app), &stub)?;
-    let goals = advertises(
-        &site,
-        &app,
-        "/crossing/act/goal",
-        &action.action_goal,
-        false,
-    )?;
-    let stop = types.message("actionlib_msgs/GoalID")?;
-    let stop = advertises(&site, &app, "/crossing/act/cancel", &stop, false)?;
-    site.connected(&*goals, 1)?;
-    site.connected(&*stop, 1)?;
-    let mut results = listens(&site, &app, "/crossing/act/result")?;
-    let mut feedback = listens(&site, &app, "/crossing/act/feedback")?;
-    // As clients of actions do: once the status comes, so will the others.
-    let mut status = listens(&site, &app, "/crossing/act/status")?;
-    with_log(site.next(&mut status), &stub)?;
-    let now = link::clock::now() + HOUR * 1_000_000_000;
-    let goal = |id: &str, steps: u32| {
-        let goal = Written::default().word(0).time(now).text("");
-        goal.time(now).text(id).word(steps).0
-    };
-    goals.publish(goal("three", 3).into());
-    // header · status { goal_id { stamp, id }, status, text } · result
-    let told = Written::default().time(now).text("three").0;
-    let result = with_log(site.next(&mut results), &stub)?;
-    let holds = |bytes: &[u8]| bytes.windows(told.len()).any(|part| part == told);
-    ensure!(
-        holds(&result.bytes) && result.bytes.ends_with(&[3, 0, 0, 0]),
-        "{result:?}"
-    );
-    for step in 0..3_u8 {
-        let step_done = with_log(site.next(&mut feedback), &stub)?;
-        ensure!(
-            holds(&step_done.bytes) && step_done.bytes.ends_with(&[step, 0, 0, 0]),
-            "{step_done:?}"
-        );
-    }
-    // One without end is cancelled once it is under way.
-    goals.publish(goal("long", 1_000_000).into());
-    with_log(site.next(&mut feedback), &stub)?;
-    stop.publish(Written::default().time(0).text("long").0.into());
-    let result = with_log(site.next(&mut results), &stub)?;
-    let steps = i32::from_le_bytes(*result.bytes.last_chunk().context("a number")?);
-    ensure!(steps < 0, "{result:?}");
-    Ok(())
-}
-
-/// A network over which nothing comes in time.
-const LATE: Badness = Badness {
-    rate: 100_000,
-    delay: 15_000,
-    jitter: 0,
-    loss: 0.0,
-    limit: 10_000,
-};
-
-pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let action = types.action("actionlib/Test")?;
-    let cable = Cable::new(&daemon.address)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let node = ("crossing_py", "crossing.py");
-    let program = "/opt/cloudroid/install/lib/crossing_py/crossing.py";
-    let workspace = site.installs_original(&daemon, "crossing_py", node, program)?;
-    let toml = format!(
-        "server = \"ws://{}\"\nservice = \"crossing_py\"\nrobot = \"crossing-late-action\"\nlocal = \"cold\"\n\
-         desire = 5.0\nmax = 5.0\nthreshold = 4.0\ninitial = 15.0\n",
-        cable.server
-    );
-    let workspace = workspace.to_string_lossy();
-    let environment = [("CMAKE_PREFIX_PATH", &*workspace), ("NO_COLOR", "1")];
-    let stub = site.stub_among(&environment, &toml, node.0, node.1, &["__name:=crossing"])?;
-    with_log(is_there(&site, &app), &stub)?;
-    let goals = "/crossing/act/goal";
-    let goals = advertises(&site, &app, goals, &action.action_goal, false)?;
-    site.connected(&*goals, 1)?;
-    let mut results = listens(&site, &app, "/crossing/act/result")?;
-    let mut feedback = listens(&site, &app, "/crossing/act/feedback")?;
-    let mut status = listens(&site, &app, "/crossing/act/status")?;
-    with_log(site.next(&mut status), &stub)?;
-    let now = link::clock::now();
-    let asks = |id: &str, steps: u32| {
-        let goal = Written::default().word(0).time(now).text("").time(now);
-        goals.publish(goal.text(id).word(steps).0.into());
-    };
-    let is_of = |message: &Message, id: &str| {
-        let told = Written::default().time(now).text(id).0;
-        message.bytes.windows(told.len()).any(|part| part == told)
-    };
-    let mut all: Vec<Message> = Vec::new();
-    let mut hears = |id: &str| -> Verdict {
-        while !all.iter().any(|result| is_of(result, id)) {
-            let result = with_log(site.next(&mut results), &stub)?;
-            all.push(result);
-        }
-        Ok(())
-    };
-    asks("quick", 2);
-    hears("quick")?;
-    cable.degrade(LATE)?;
-    // Two that are late, and it is started; it carries them out as well.
-    asks("late-1", 1);
-    asks("late-2", 1);
-    stub.says("the local original answers, too")?;
-    hears("late-1")?;
-    hears("late-2")?;
-    // Whoever is first with a goal's feedback goes on with it.
-    asks("steps", 3);
-    hears("steps")?;
-    let mut steps = Vec::new();
-    while steps.len() < 3 {
-        let step = with_log(site.next(&mut feedback), &stub)?;
-        if is_of(&step, "steps") {
-            steps.push(i32::from_le_bytes(
-                *step.bytes.last_chunk().context("a number")?,
-            ));
-        }
-    }
-    ensure!(steps == [0, 1, 2], "{steps:?}");
-    ensure!(!stub.said().contains("is stopped"), "{}", stub.said());
-    cable.restore()?;
-    let deadline = Instant::now() + PATIENCE;
-    let mut asked = 0;
-    while !stub.said().contains("the local original is stopped") {
-        ensure!(Instant::now() < deadline, "{}", stub.said());
-        asked += 1;
-        let id = format!("good-{asked}.");
-        asks(&id, 0);
-        hears(&id)?;
-    }
-    // What the cloud still owed has come before this.
-    asks("last", 1);
-    hears("last")?;
-    let mut ids: Vec<String> = ["quick", "late-1", "late-2", "steps", "last"]
-        .map(str::to_owned)
-        .into();
-    ids.extend((1..=asked).map(|number| format!("good-{number}.")));
-    for id in ids {
-        let times = all.iter().filter(|result| is_of(result, &id)).count();
-        ensure!(times == 1, "{id}: {times} results\n{}", stub.said());
-    }
-    Ok(())
-}
-
-pub fn explain_names_a_clock_and_a_queue() -> Verdict {
-    let daemon = world().with(CROSSING)?;
-    let types = types()?;
-    let stamped = types.message("geometry_msgs/PointStamped")?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let robot = "crossing-explained";
+pub fn explain_names_a_clock_and_a_queue(ros: RosVersion) -> Verdict {
+    let daemon = world().with(service(ros).0)?;
+    let stamped = of(ros, "geometry_msgs/PointStamped")?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = &*robot_of(ros, "explained");
     let settings = "desire = 20.0\nmax = 20.0\nrequest = \"/crossing/work -> /crossing/worked\"";
     let stub = crossing(&site, &daemon.address, robot, HOUR, settings)?;
     with_log(is_there(&site, &app), &stub)?;
@@ -456,17 +445,17 @@ pub fn explain_names_a_clock_and_a_queue() -> Verdict {
     site.connected(&*points, 1)?;
     let mut worked = site.hears(&app, "/crossing/worked")?;
     let now = link::clock::now() + HOUR * 1_000_000_000;
-    let say = || points.publish(point(now).into());
+    let say = || points.publish(point(ros, now));
     with_log(answers(&site, say, &mut worked), &stub)?;
     // Each takes the node 50 ms, and they come all at once.
     let bursts = 2;
     for burst in 0..bursts {
         let sent: Vec<i64> = (1..=8).map(|number| now + burst * 100 + number).collect();
         for at in &sent {
-            points.publish(point(*at).into());
+            points.publish(point(ros, *at));
         }
-        let last = point(*sent.last().context("some")?);
-        while with_log(site.next(&mut worked), &stub)?.bytes[4..] != last[4..] {}
+        let last = point(ros, *sent.last().context("some")?);
+        while !is_same(&with_log(site.next(&mut worked), &stub)?.bytes, &last) {}
     }
     let path = format!("/api/v1/robots/{robot}/explain");
     let explained = daemon.awaits(&path, "a queue and a clock among the causes", |explained| {

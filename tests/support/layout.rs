@@ -82,6 +82,21 @@ impl Layout {
         self.u32(number).u32(0).text(frame)
     }
 
+    /// A moment, in nanoseconds since 1970.
+    pub fn time(&mut self, at: i64) -> &mut Self {
+        let part = |part: i64| u32::try_from(part).unwrap_or(0);
+        self.u32(part(at / 1_000_000_000))
+            .u32(part(at % 1_000_000_000))
+    }
+
+    /// A std_msgs/Header of that moment.
+    pub fn header_of(&mut self, at: i64, frame: &str) -> &mut Self {
+        if self.format == WireFormat::Ros1 {
+            self.u32(0);
+        }
+        self.time(at).text(frame)
+    }
+
     /// What was written.
     pub fn finish(&mut self) -> Bytes {
         std::mem::take(&mut self.out).freeze()

@@ -40,6 +40,8 @@ struct State {
     actions: BTreeMap<String, Action>,
     /// Services that nodes may call, by number: the node, the name and the type.
     clients: BTreeMap<u128, (String, String, ServiceType)>,
+    /// Who is told of changes of parameters.
+    watchers: parameters::Watchers,
 }
 
 #[derive(Default)]

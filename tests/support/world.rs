@@ -84,6 +84,18 @@ pub const CROSSING: Service = Service {
     arguments: &["--node", "crossing.py"],
 };
 
+/// The same for ROS 2, with the message of transforms, which the base has not.
+pub const CROSSING_TWO: Service = Service {
+    name: "crossing_ros2",
+    package: Some("crossing_ros2"),
+    arguments: &[
+        "--name",
+        "crossing_ros2",
+        "--node",
+        "crossing_ros2/crossing",
+    ],
+};
+
 /// Our Python package that needs a map.
 pub const LOCALISER: Service = Service {
     name: "localiser_py",

@@ -194,11 +194,14 @@ pub(crate) fn strings(report: &mut Report) -> Result<()> {
 /// Calls.
 pub(crate) fn calls(report: &mut Report) -> Result<()> {
     let mut ways = vec![
-        (Way::Ours, vec![Way::Rclpy, Way::Stock]),
+        (Way::Ours, vec![Way::Datagrams, Way::Rclpy, Way::Stock]),
         (Way::Bus, vec![Way::Ours]),
+        (Way::Hop, vec![Way::Datagrams]),
     ];
     ways.extend(with_nodes());
     ways.extend(through(&Rival::all(report)));
+    // A call is one message there and one back, as a String is.
+    ways.push((Way::Portal, vec![Way::Hop]));
     measure(report, "service call", "calls", &ways)
 }
 

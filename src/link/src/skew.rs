@@ -8,13 +8,13 @@
 //! back as it was, even when the difference has been measured anew meanwhile.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicI64, Ordering};
 
 use bytes::{Bytes, BytesMut};
 use parking_lot::Mutex;
 
 use crate::clock::Sample;
-use ros::codec::Stamps;
+use ros::codec::{Stamps, Time};
 
 /// A difference smaller than this, beyond what the measurement leaves open, is none: 1 ms.
 const NOTICED: i64 = 1_000_000;
@@ -36,8 +36,6 @@ pub enum Direction {
 pub struct Skew {
     /// Robot's clock minus ours, in nanoseconds; 0: none that counts.
     difference: AtomicI64,
-    /// Stamps are none of a wall clock, or the robot wants them as they are.
-    off: AtomicBool,
     known: Mutex<Known>,
 }
 
@@ -60,18 +58,9 @@ impl Skew {
         }
     }
 
-    /// Whether stamps go as they are: they are simulated time, or nobody wants them changed.
-    pub fn leave(&self, off: bool) {
-        self.off.store(off, Ordering::Relaxed);
-    }
-
     /// What is added to our time to have the robot's, in nanoseconds.
     pub fn difference(&self) -> i64 {
-        if self.off.load(Ordering::Relaxed) {
-            0
-        } else {
-            self.difference.load(Ordering::Relaxed)
-        }
+        self.difference.load(Ordering::Relaxed)
     }
 
     /// The message with its stamps in the other side's time. Stamps of zero stay zero, and so does what no clock shows.
@@ -95,54 +84,51 @@ impl Skew {
             Direction::Out => (difference, robots, ours),
         };
         for at in found {
-            let Some(bytes) = message.get_mut(at..at + 8) else {
+            let Some(stamp) = stamps.read(&message, at) else {
                 continue;
             };
-            let stamp = u64::from_le_bytes([
-                bytes[0], bytes[1], bytes[2], bytes[3], bytes[4], bytes[5], bytes[6], bytes[7],
-            ]);
             let changed = there
                 .get(stamp)
                 .or_else(|| shifted(stamp, change))
                 .unwrap_or(stamp);
             if changed != stamp {
                 back.note(changed, stamp);
-                bytes.copy_from_slice(&changed.to_le_bytes());
+                stamps.write(&mut message, at, changed);
             }
         }
         message.freeze()
     }
 }
 
-/// A stamp as on the wire: seconds in the lower half, nanoseconds in the upper. None for what is no time of a clock.
-fn shifted(stamp: u64, by: i64) -> Option<u64> {
-    let seconds = i64::from(stamp as u32);
-    let nanoseconds = i64::from((stamp >> 32) as u32);
-    if stamp == 0 || nanoseconds >= SECOND {
+/// None for what is no time of a clock.
+fn shifted(stamp: Time, by: i64) -> Option<Time> {
+    let nanoseconds = i64::from(stamp.nsecs);
+    if stamp == Time::default() || nanoseconds >= SECOND {
         return None;
     }
-    let total = (seconds * SECOND + nanoseconds).checked_add(by)?;
+    let total = (i64::from(stamp.secs) * SECOND + nanoseconds).checked_add(by)?;
     if total <= 0 {
         return None;
     }
-    let seconds = u64::from(u32::try_from(total / SECOND).ok()?);
-    let nanoseconds = u64::try_from(total % SECOND).ok()?;
-    Some(seconds | nanoseconds << 32)
+    Some(Time {
+        secs: u32::try_from(total / SECOND).ok()?,
+        nsecs: u32::try_from(total % SECOND).ok()?,
+    })
 }
 
 /// The last of them.
 #[derive(Debug, Default)]
 struct Pairs {
-    found: HashMap<u64, u64>,
-    order: VecDeque<u64>,
+    found: HashMap<Time, Time>,
+    order: VecDeque<Time>,
 }
 
 impl Pairs {
-    fn get(&self, key: u64) -> Option<u64> {
+    fn get(&self, key: Time) -> Option<Time> {
         self.found.get(&key).copied()
     }
 
-    fn note(&mut self, key: u64, value: u64) {
+    fn note(&mut self, key: Time, value: Time) {
         if self.found.insert(key, value).is_some() {
             return;
         }

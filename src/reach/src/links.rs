@@ -19,6 +19,7 @@ mod inputs;
 mod lent;
 mod mirror;
 mod node_link;
+mod node_time;
 mod nodes;
 mod outputs;
 mod parameters;

@@ -2,11 +2,37 @@
 
 use async_trait::async_trait;
 use ros::bus::{
-    BusError, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvents,
-    ParameterKind, ParameterNames,
+    BusError, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvent,
+    ParameterEvents, ParameterKind, ParameterNames,
 };
+use tokio::sync::mpsc;
 
 use super::MemoryBus;
+
+/// Who is told of changes.
+pub(super) type Watchers = Vec<mpsc::UnboundedSender<ParameterEvent>>;
+
+/// Changes of one node, or of all.
+struct Events {
+    node: Option<String>,
+    told: mpsc::UnboundedReceiver<ParameterEvent>,
+}
+
+#[async_trait]
+impl ParameterEvents for Events {
+    async fn next(&mut self) -> Option<ParameterEvent> {
+        loop {
+            let event = self.told.recv().await?;
+            if self.node.as_ref().is_none_or(|node| *node == event.node) {
+                return Some(event);
+            }
+        }
+    }
+
+    fn dropped(&self) -> u64 {
+        0
+    }
+}
 
 /// The value as a parameter takes it that has another one.
 fn fitting(held: &ParamValue, given: ParamValue) -> Result<ParamValue, String> {
@@ -46,16 +72,28 @@ impl NodeParameters for MemoryBus {
             }
             let held = state.parameters.entry(node.to_owned()).or_default();
             let mut done = Vec::new();
+            let mut event = ParameterEvent {
+                node: node.to_owned(),
+                ..ParameterEvent::default()
+            };
             for (name, value) in changes {
                 let value = match (held.get(&name), value) {
                     (Some(before), Some(given)) => fitting(before, given).map(Some),
                     (_, given) => Ok(given),
                 };
                 done.push(value.map(|value| match value {
-                    Some(value) => drop(held.insert(name, value)),
-                    None => drop(held.remove(&name)),
+                    Some(value) => match held.insert(name.clone(), value.clone()) {
+                        Some(_) => event.changed.push((name, value)),
+                        None => event.new.push((name, value)),
+                    },
+                    None => {
+                        held.remove(&name);
+                        event.deleted.push(name);
+                    }
                 }));
             }
+            let watchers = &mut state.watchers;
+            watchers.retain(|watcher| watcher.send(event.clone()).is_ok());
             Ok(done)
         })
     }
@@ -102,7 +140,10 @@ impl NodeParameters for MemoryBus {
         Ok(described.collect())
     }
 
-    async fn watch(&self, _node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {
-        Err(BusError::NotOffered("events of parameters"))
+    async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {
+        let (watcher, told) = mpsc::unbounded_channel();
+        self.system.state.lock().watchers.push(watcher);
+        let node = node.map(str::to_owned);
+        Ok(Box::new(Events { node, told }))
     }
 }

@@ -1,3 +1,4 @@
+use ros::bus::RosVersion;
 use ros::schema::Registry;
 
 use super::*;
@@ -84,12 +85,31 @@ fn what_no_clock_shows_stays() {
     // Too short to be one: as it is, for the node to refuse.
     let short = Bytes::from_static(&[0; 11]);
     assert_eq!(skew.apply(Direction::In, &header(), short.clone()), short);
-    skew.leave(true);
-    let message = stamped(1_700_000_120, 7);
-    assert_eq!(
-        skew.apply(Direction::In, &header(), message.clone()),
-        message
-    );
+}
+
+#[test]
+fn stamps_of_either_order_of_bytes_are_changed_and_meet() {
+    let skew = ahead();
+    let registry = Registry::of(RosVersion::Two);
+    let header = Stamps::of(&registry.message("std_msgs/msg/Header").unwrap());
+    let big = |seconds: u32, nanoseconds: u32| -> Bytes {
+        let parts = [[0; 4], seconds.to_be_bytes(), nanoseconds.to_be_bytes()];
+        let parts = [&parts.concat()[..], &1_u32.to_be_bytes(), &[0; 4]];
+        parts.concat().into()
+    };
+    let little = |seconds: u32, nanoseconds: u32| -> Bytes {
+        let parts = [seconds, nanoseconds, 1, 0].map(u32::to_le_bytes);
+        [&[0, 1, 0, 0][..], &parts.concat()].concat().into()
+    };
+    let sent = big(1_700_000_120, 7);
+    let here = skew.apply(Direction::In, &header, sent.clone());
+    assert_eq!(here, big(1_700_000_000, 0));
+    assert_eq!(skew.apply(Direction::Out, &header, here), sent);
+    // A node of a little endian machine copies the stamp, and the clocks have been compared anew meanwhile.
+    skew.measured(measured(AHEAD + 50_000_000, 100_000));
+    let copied = little(1_700_000_000, 0);
+    let there = skew.apply(Direction::Out, &header, copied);
+    assert_eq!(there, little(1_700_000_120, 7));
 }
 
 #[test]

@@ -78,10 +78,10 @@ impl Inputs {
         self.channels.lock().insert(input.channel, fresh);
     }
 
-    /// Publishes a message; says when, and by what its answer may be known.
+    /// Publishes a message, with its stamps changed where they have to be; says when, and by what its answer may be known.
     pub(super) fn take(
         &self,
-        (skew, drops): (&Skew, &Drops),
+        (skew, drops): (Option<&Skew>, &Drops),
         data: Data,
         arrived: i64,
     ) -> Option<(Mark, Answered)> {
@@ -91,7 +91,10 @@ impl Inputs {
         // By the robot's stamp: outputs are looked at when theirs are the robot's again.
         let mark = mark(&message);
         channel.sizes.note(&message);
-        let message = skew.apply(Direction::In, &channel.stamps, message);
+        let message = match skew {
+            Some(skew) => skew.apply(Direction::In, &channel.stamps, message),
+            None => message,
+        };
         match &mut channel.state {
             State::Open(publisher) => publisher.publish(message),
             State::Waiting(waiting) => {

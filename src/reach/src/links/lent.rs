@@ -24,7 +24,7 @@ use tokio::time::{Instant as Moment, timeout_at};
 use super::node_link::NodeLink;
 use super::{Hub, types};
 use link::control::{FromCloud, Served};
-use link::skew::Direction;
+use link::skew::{Direction, Skew};
 use ros::codec::Stamps;
 
 /// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
@@ -295,7 +295,8 @@ impl Drop for Abandoned<'_> {
 fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     let of = served.service_type(hub.bus.version());
     let known = types::service(&hub.registry, &of);
-    if known.is_none() && hub.skew.difference() != 0 {
+    let differs = |skew: &Skew| skew.difference() != 0;
+    if known.is_none() && link.skew(hub).is_some_and(differs) {
         link.session.report(&FromCloud::Notice {
             warning: true,
             text: format!(
@@ -393,8 +394,11 @@ impl ServiceHandler for Passing {
                 told_apart(&self.of)
             ));
         }
-        let request = hub.skew.apply(Direction::Out, &there.request, request);
+        // Whichever way it goes, its stamps are those of the node that calls.
+        let calling = hub.links.lock().get(caller).cloned();
+        let calling = calling.unwrap_or_else(|| Arc::clone(&link));
+        let request = calling.shift(&hub, Direction::Out, &there.request, request);
         let response = link.call_robot(there.channel, request).await?;
-        Ok(hub.skew.apply(Direction::In, &there.response, response))
+        Ok(calling.shift(&hub, Direction::In, &there.response, response))
     }
 }

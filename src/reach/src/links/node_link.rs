@@ -14,6 +14,7 @@ use super::duplicates::Machine;
 use super::held::{Held, Hold};
 use super::inputs::Inputs;
 use super::lent::RobotServices;
+use super::node_time::{self, NodeTime};
 use super::outputs::Outputs;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror, seen};
@@ -55,6 +56,7 @@ pub(super) struct NodeLink {
     pub(super) lent: RobotServices,
     pub(super) services: Mutex<HashMap<u32, Arc<Service>>>,
     pub(super) listening: Mutex<BTreeSet<String>>,
+    pub(super) time: NodeTime,
     sla: Sla,
     requests: Mutex<VecDeque<Request>>,
     unsent: Unsent,
@@ -104,6 +106,7 @@ impl NodeLink {
             lent: RobotServices::new(hello.lends),
             services: Mutex::default(),
             listening: Mutex::default(),
+            time: NodeTime::of(hello),
             sla: hello.sla.clone(),
             requests: Mutex::default(),
             unsent: Unsent::default(),
@@ -119,6 +122,7 @@ impl NodeLink {
             tokio::spawn(obey(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
             tokio::spawn(deliver(Arc::clone(&link), Arc::clone(hub), sent)).abort_handle(),
             tokio::spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
+            tokio::spawn(node_time::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
         ];
         let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
         tasks.push(
@@ -266,10 +270,10 @@ impl NodeLink {
                 _ => hub.options.call_timeout,
             };
             service.sizes.note(&request);
-            let request = hub.skew.apply(Direction::In, &service.request, request);
+            let request = link.shift(&hub, Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;
-            let called =
-                called.map(|response| hub.skew.apply(Direction::Out, &service.response, response));
+            let called = called
+                .map(|response| link.shift(&hub, Direction::Out, &service.response, response));
             link.session.answer(
                 id,
                 taken,
@@ -352,7 +356,8 @@ impl NodeLink {
                     return;
                 };
                 let channel = data.channel;
-                let taken = self.inputs.take((&hub.skew, &self.drops), data, arrived);
+                let skew = self.skew(&hub);
+                let taken = self.inputs.take((skew, &self.drops), data, arrived);
                 if let Some((mark, answered)) = taken {
                     self.outputs.note(channel, mark, answered);
                 }

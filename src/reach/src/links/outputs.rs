@@ -164,7 +164,7 @@ impl Outputs {
                     // Other nodes of the servant have links of their own.
                     if message.publisher.node() == reader.node {
                         let Some(hub) = hub.upgrade() else { break };
-                        let bytes = hub.skew.apply(Direction::Out, &stamps, message.bytes);
+                        let bytes = reader.shift(&hub, Direction::Out, &stamps, message.bytes);
                         reader.send(channel, bytes, message.latching);
                     }
                 }

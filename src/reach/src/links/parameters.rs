@@ -10,11 +10,9 @@ use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
 use super::Hub;
+use super::node_time::SIMULATED;
 use super::runs::RUNS;
 use link::control::{FromCloud, Hello, Node};
-
-/// Stamps are simulated time.
-const SIMULATED: &str = "use_sim_time";
 
 /// Whether the Master's side has it of itself, or keeps runs of nodes there.
 fn is_own(name: &str) -> bool {
@@ -41,9 +39,6 @@ impl Drop for Known {
 impl Known {
     /// Takes over all of the robot's parameters, those that the deployer gave last.
     pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
-        // A robot of ROS 2, which has no other parameters, tells this one of its node's.
-        let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
-        hub.skew.leave(hello.keep_stamps || simulated);
         let Ok(parameters) = hub.bus.parameters() else {
             return;
         };
@@ -67,7 +62,7 @@ impl Known {
     pub(super) async fn change(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
         for (key, value) in changes {
             if key.trim_start_matches('/') == SIMULATED {
-                hub.skew.leave(value == Some(ParamValue::Bool(true)));
+                hub.simulate(value == Some(ParamValue::Bool(true)));
             }
             match value {
                 Some(value) => self.set(hub, key, value).await,

@@ -10,6 +10,8 @@ use super::*;
 use link::control::{Exit, FromRobot, Input, Node, Resume};
 use link::record::Record;
 
+mod node_time;
+
 /// A servant whose nodes run from when they are started, and say nothing.
 #[derive(Default)]
 struct Quiet {

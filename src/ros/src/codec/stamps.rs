@@ -71,32 +71,52 @@ impl Stamps {
         self.steps.is_empty()
     }
 
-    /// Where the stamps begin; none where the message is not of this type (too short), or not little endian, as stamps
-    /// are written.
+    /// Where the stamps begin; none where the message is not of this type (too short).
     pub fn find(&self, message: &[u8]) -> Option<Vec<usize>> {
         let mut walk = Walk {
             cursor: Cursor::new(self.version, message)?,
             found: Vec::new(),
         };
-        if walk.cursor.is_big_endian() {
-            return None;
-        }
         walk.steps(&self.steps)?;
         Some(walk.found)
     }
 
-    /// The first stamp: of a message that begins with a header, the header's.
-    pub fn first(&self, message: &[u8]) -> Option<Time> {
-        let at = *self.find(message)?.first()?;
+    /// The stamp that was found there.
+    pub fn read(&self, message: &[u8], at: usize) -> Option<Time> {
+        let is_big_endian = Cursor::new(self.version, message)?.is_big_endian();
         let word = |at: usize| {
-            Some(u32::from_le_bytes(
-                message.get(at..at + 4)?.try_into().ok()?,
-            ))
+            let word: [u8; TIME_PART] = message.get(at..at + TIME_PART)?.try_into().ok()?;
+            Some(match is_big_endian {
+                true => u32::from_be_bytes(word),
+                false => u32::from_le_bytes(word),
+            })
         };
         Some(Time {
             secs: word(at)?,
-            nsecs: word(at + 4)?,
+            nsecs: word(at + TIME_PART)?,
         })
+    }
+
+    /// Puts another there, in the order of bytes that the message is written in. Nothing where none could be read.
+    pub fn write(&self, message: &mut [u8], at: usize, stamp: Time) {
+        let order = Cursor::new(self.version, message).map(|cursor| cursor.is_big_endian());
+        let (Some(is_big_endian), Some(place)) = (order, message.get_mut(at..at + TIME)) else {
+            return;
+        };
+        for (word, part) in place
+            .chunks_exact_mut(TIME_PART)
+            .zip([stamp.secs, stamp.nsecs])
+        {
+            word.copy_from_slice(&match is_big_endian {
+                true => part.to_be_bytes(),
+                false => part.to_le_bytes(),
+            });
+        }
+    }
+
+    /// The first stamp: of a message that begins with a header, the header's.
+    pub fn first(&self, message: &[u8]) -> Option<Time> {
+        self.read(message, *self.find(message)?.first()?)
     }
 }
 

@@ -401,9 +401,18 @@ proptest! {
             // More elements without any bytes than bytes follow are not looked at: ROS 1's alone have none.
             let same = value.as_ref().map_or(version == RosVersion::One, |value| is_same(value, &json));
             prop_assert!(same, "{:?} is not {}", value, json);
-            // Stamps are rewritten in place, little endian.
-            let stamps = (!big_endian).then_some(writer.times);
-            prop_assert_eq!(Stamps::of(&message).find(&bytes), stamps);
+            let stamps = Stamps::of(&message);
+            prop_assert_eq!(stamps.find(&bytes), Some(writer.times.clone()));
+            // Whatever is written there is read again, and nothing beside it is touched.
+            let mut again = bytes.clone();
+            for at in writer.times {
+                let stamp = stamps.read(&bytes, at).unwrap();
+                let other = Time { secs: !stamp.secs, nsecs: !stamp.nsecs };
+                stamps.write(&mut again, at, other);
+                prop_assert_eq!(stamps.read(&again, at), Some(other));
+                stamps.write(&mut again, at, stamp);
+            }
+            prop_assert_eq!(again, bytes);
         }
     }
 

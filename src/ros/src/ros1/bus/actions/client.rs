@@ -23,6 +23,9 @@ use crate::schema::ActionDef;
 
 /// A goal that the server has stopped speaking of is lost.
 const LOST_AFTER: Duration = Duration::from_secs(5);
+/// So is one that it has never spoken of, after much longer: the clients of actionlib wait for that without end, since a server may be slow, or another
+/// one may take the goal in its place.
+const NEVER_TAKEN: Duration = Duration::from_secs(60);
 /// How long a cancel waits for a server that has taken the goal and is not connected for cancels yet.
 const CANCEL_WAITS: Duration = Duration::from_secs(10);
 /// A server that publishes no results for so long is gone.
@@ -62,9 +65,30 @@ enum State {
 }
 
 struct Goal {
-    /// When the server last spoke of it.
+    /// When the server last spoke of it, or when it was sent.
     seen: Instant,
+    /// For how long the server may say nothing of it.
+    patience: Duration,
     events: Arc<dyn GoalEvents>,
+}
+
+impl Goal {
+    fn sent(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
+        Self {
+            seen: now,
+            patience: NEVER_TAKEN,
+            events,
+        }
+    }
+
+    fn is_heard_of(&mut self, now: Instant) {
+        self.seen = now;
+        self.patience = LOST_AFTER;
+    }
+
+    fn is_lost(&self, now: Instant) -> bool {
+        now.duration_since(self.seen) > self.patience
+    }
 }
 
 /// What the server publishes.
@@ -154,8 +178,7 @@ impl ActionClient for Client {
         let Some(ends) = self.shared.ends.get() else {
             return events.ended(Err(format!("action {} is not ready", self.shared.name)));
         };
-        let seen = Instant::now();
-        let known = Goal { seen, events };
+        let known = Goal::sent(Instant::now(), events);
         self.shared.goals.lock().insert(id.to_owned(), known);
         let stamp = Time::now();
         let id = GoalId {
@@ -290,7 +313,7 @@ impl Shared {
         };
         let events = match self.goals.lock().get_mut(&state.goal.id) {
             Some(goal) => {
-                goal.seen = Instant::now();
+                goal.is_heard_of(Instant::now());
                 goal.events.clone()
             }
             None => return,
@@ -335,8 +358,8 @@ impl Shared {
         let mut goals = self.goals.lock();
         for (id, goal) in goals.iter_mut() {
             if states.iter().any(|state| state.goal.id == *id) {
-                goal.seen = now;
-            } else if now.duration_since(goal.seen) > LOST_AFTER {
+                goal.is_heard_of(now);
+            } else if goal.is_lost(now) {
                 lost.push(id.clone());
             }
         }
@@ -380,5 +403,28 @@ async fn watch_server(shared: Arc<Shared>) {
         if graph.wait_for(there).await.is_err() {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Nobody;
+
+    impl GoalEvents for Nobody {
+        fn feedback(&self, _: Bytes) {}
+
+        fn ended(&self, _: Result<GoalEnd, String>) {}
+    }
+
+    #[test]
+    fn a_goal_that_nobody_took_yet_is_waited_for_longer_than_one_that_was_dropped() {
+        let begin = Instant::now();
+        let after = |seconds| begin + Duration::from_secs(seconds);
+        let mut goal = Goal::sent(begin, Arc::new(Nobody));
+        assert!(!goal.is_lost(after(30)) && goal.is_lost(after(61)));
+        goal.is_heard_of(after(30));
+        assert!(!goal.is_lost(after(34)) && goal.is_lost(after(36)));
     }
 }
