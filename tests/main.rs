@@ -52,6 +52,8 @@ mod eval;
 mod failover;
 #[path = "stories/fallback.rs"]
 mod fallback;
+#[path = "stories/farewells.rs"]
+mod farewells;
 #[path = "stories/goals.rs"]
 mod goals;
 #[path = "stories/grants.rs"]
@@ -371,6 +373,7 @@ fn main() -> ExitCode {
             a_labs_own_authority_speaks_for_its_robots,
             a_stub_is_installed_and_paired_by_one_line,
         ],
+        of_both![farewells: a_stub_ends_beside_a_daemon_that_is_frozen_or_killed],
         stories![patience: a_node_that_waits_is_seen_whole_and_driven_by_its_robot],
         stories![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
         stories![link:

@@ -47,7 +47,7 @@ enum End {
     Replaced(Box<WebSocket<Stream>>),
 }
 
-/// Keeps a link until the cloud refuses it; says why.
+/// Keeps a link until the cloud refuses it, or this side ends it; says why.
 pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
     let mut link = Link {
         config,
@@ -67,6 +67,7 @@ pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> S
             None => link.once().await,
         };
         let reason = match outcome {
+            Ok(End::Lost(lost @ Lost::Ended)) => return lost.to_string(),
             Ok(End::Lost(lost)) => {
                 tracing::warn!("the link to {} was lost: {lost}", config.server);
                 told.clear();

@@ -18,6 +18,7 @@ mod arguments;
 mod config;
 mod connect;
 mod doctor;
+mod farewell;
 mod http;
 mod linked;
 mod local;

@@ -12,7 +12,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use link::control::{Exit, FromRobot, Hello, Sla};
+use futures_util::FutureExt;
+use link::control::{Exit, Hello, Sla};
 use link::{RobotSession, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
@@ -21,9 +22,10 @@ use ros::bus::{Bus, BusError, ParamValue, RosVersion};
 use ros::net::Sockets;
 use tokio::signal::unix::{SignalKind, signal as signals};
 use tokio::sync::watch;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use crate::config::{self, Config, Group, Local};
+use crate::farewell;
 use crate::linked;
 use crate::local::{Program, Setting};
 use crate::machine;
@@ -35,8 +37,6 @@ use crate::resolver::RobotSockets;
 use crate::revision::Revision;
 use crate::robot::{Place, Robot, usual_name};
 
-/// For the real node to end after it was told to. roslaunch escalates after 15 s.
-const FAREWELL: Duration = Duration::from_secs(12);
 /// Where no T_max is given, a link silent for so long counts as down.
 const SILENT: Duration = Duration::from_secs(2);
 
@@ -68,7 +68,8 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
     let variable = |name: &str| std::env::var(name).ok();
     let robot = runtime.block_on(Robot::read(&asked.argv, &usual, ros, &variable))?;
     let end = runtime.block_on(live(asked, config.clone(), &robot))?;
-    drop(runtime);
+    // Whatever still runs elsewhere (a codec, say) is not waited for.
+    runtime.shutdown_background();
     match end {
         End::Asked => Ok(ExitCode::SUCCESS),
         End::Node(exit) => Ok(exit_as(&exit)),
@@ -84,10 +85,64 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
 
 async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> anyhow::Result<End> {
     let mut stopping = stopping()?;
-    let bus = tokio::select! {
-        bus = join(robot, &robot.node) => bus?,
-        () = stopped(&mut stopping) => return Ok(End::Asked),
+    let mut buses = Vec::new();
+    let begun = tokio::select! {
+        begun = begin(asked, config, robot, &mut buses) => begun.map(Some),
+        () = stopped(&mut stopping) => Ok(None),
     };
+    let Begun {
+        config,
+        mirror,
+        mut hello,
+        mut shutdown,
+    } = match begun {
+        Ok(Some(begun)) => begun,
+        over => {
+            farewell::of_the_robot(&buses).await;
+            return over.map(|_| End::Asked);
+        }
+    };
+    let renewing = tokio::spawn(pairing::keep_renewed(config.clone()));
+    let mut exit = mirror.exit();
+    let linked = linked::keep(&config, &mirror, &mut hello).fuse();
+    tokio::pin!(linked);
+    let end = tokio::select! {
+        refused = &mut linked => End::Refused(refused),
+        ended = exit.wait_for(Option::is_some) => node_end(ended.ok().and_then(|exit| exit.clone())),
+        signal = asked_to_stop(&mut stopping, &mut shutdown) => {
+            tracing::debug!(signal, "asked to end");
+            let other = async {
+                tokio::select! {
+                    _ = &mut linked => {}
+                    _ = asked_to_stop(&mut stopping, &mut shutdown) => {}
+                }
+            };
+            node_end(farewell::of_the_node(&mirror, signal, other).await)
+        }
+    };
+    renewing.abort();
+    farewell::of_all(&mirror, linked, &buses).await;
+    Ok(end)
+}
+
+/// What there is before the cloud is asked for.
+struct Begun {
+    config: Config,
+    mirror: Arc<Mirror>,
+    hello: Hello,
+    /// XML-RPC's `shutdown`.
+    shutdown: Option<watch::Receiver<Option<String>>>,
+}
+
+/// Becomes a node of the robot; `buses` are those that it has joined so far.
+async fn begin(
+    asked: &crate::arguments::Run,
+    config: Config,
+    robot: &Robot,
+    buses: &mut Vec<Arc<dyn Bus>>,
+) -> anyhow::Result<Begun> {
+    let bus = join(robot, &robot.node).await?;
+    buses.push(Arc::clone(&bus));
     let config = with_parameters(config, &*bus, robot).await?;
     let config = config.or(&Revision::read(&asked.node.share).defaults);
     if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
@@ -95,26 +150,25 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
             "fallback_after counts only until the server is reached for the first time where desire and max, a rate or an age are given: then those decide when the local original answers"
         );
     }
-    let mut shutdown = bus.shutdown_requested();
+    let shutdown = bus.shutdown_requested();
     let session = Arc::new(RobotSession::new(session_options(&config)));
     let label = format!("{} for {}", config.service, config.robot());
     if let Ok(lending) = bus.lending() {
         lending.set_label(&label);
     }
     let mirror = Mirror::start(bus.clone(), label, session, config.call_limit());
-    let mut watcher: Option<Arc<dyn Bus>> = None;
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
-        let bus = join(robot, &format!("{}_cloudroid", robot.node)).await?;
-        let diagnostics = Diagnostics::new(&bus, &robot.node, &config.robot()).await?;
+        let watcher = join(robot, &format!("{}_cloudroid", robot.node)).await?;
+        buses.push(Arc::clone(&watcher));
+        let diagnostics = Diagnostics::new(&watcher, &robot.node, &config.robot()).await?;
         let original = local_original(asked, robot);
-        mirror.promise(sla, original, diagnostics, &bus).await?;
-        watcher = Some(bus);
+        mirror.promise(sla, original, diagnostics, &watcher).await?;
     }
     let mut parameters = mirror.parameters().await;
     if robot.sim_time {
         parameters.insert("use_sim_time".to_owned(), ParamValue::Bool(true));
     }
-    let mut hello = Hello {
+    let hello = Hello {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         ros: robot.ros.number(),
         run: format!("{:016x}", rand::random::<u64>()),
@@ -133,55 +187,24 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
         parameters,
         ..Hello::default()
     };
-    let renewing = tokio::spawn(pairing::keep_renewed(config.clone()));
-    let mut exit = mirror.exit();
-    let end = {
-        let linked = linked::keep(&config, &mirror, &mut hello);
-        tokio::pin!(linked);
-        tokio::select! {
-            refused = &mut linked => End::Refused(refused),
-            ended = exit.wait_for(Option::is_some) => node_end(&ended),
-            signal = asked_to_stop(&mut stopping, &mut shutdown) => {
-                tracing::debug!(signal, "asked to end");
-                if let Some(keeper) = mirror.keeper() {
-                    keeper.end();
-                }
-                mirror.session().report(&FromRobot::Signal { signal });
-                let up = mirror.session().is_up();
-                let patience = if up { FAREWELL } else { Duration::ZERO };
-                let mut exit = mirror.exit();
-                tokio::select! {
-                    ended = timeout(patience, exit.wait_for(Option::is_some)) => match ended {
-                        Ok(ended) => node_end(&ended),
-                        Err(_) => End::Asked,
-                    },
-                    _ = &mut linked => End::Asked,
-                    _ = asked_to_stop(&mut stopping, &mut shutdown) => End::Asked,
-                }
-            }
-        }
-    };
-    renewing.abort();
-    // In good order: the cloud ends what is left of the node at once.
-    mirror.session().end(1000, "the robot's node ended");
-    bus.close().await;
-    if let Some(watcher) = watcher {
-        watcher.close().await;
-    }
-    let mut up = mirror.session().up();
-    let _ = timeout(Duration::from_millis(500), up.wait_for(|up| !up)).await;
-    Ok(end)
+    Ok(Begun {
+        config,
+        mirror,
+        hello,
+        shutdown,
+    })
 }
 
-fn node_end(exit: &Result<watch::Ref<'_, Option<Exit>>, watch::error::RecvError>) -> End {
-    match exit.as_ref().ok().and_then(|exit| (**exit).clone()) {
+/// Of a node that has ended, or of which nothing is known.
+fn node_end(exit: Option<Exit>) -> End {
+    match exit {
         Some(exit) => {
             if exit.code != Some(0) {
                 tracing::warn!("{}", exit.text);
             }
             End::Node(exit)
         }
-        _ => End::Asked,
+        None => End::Asked,
     }
 }
 

@@ -7,7 +7,7 @@ mod throughput;
 
 use std::collections::BTreeMap;
 use std::marker::PhantomData;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
 use budget::Budget;
@@ -15,7 +15,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use serde::Serialize;
 use tokio::sync::{Notify, watch};
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 
 use crate::Error;
 use crate::clock::{Clock, Sample, now};
@@ -115,6 +115,10 @@ pub struct Session<O> {
     state: Mutex<State>,
     wake: Notify,
     up: watch::Sender<bool>,
+    /// Somebody wants to know whether the peer is there.
+    asked: AtomicBool,
+    /// Pongs so far.
+    pongs: watch::Sender<u64>,
     next_call: AtomicU32,
     orders: PhantomData<fn(O)>,
 }
@@ -168,6 +172,8 @@ impl<O: Order> Session<O> {
             }),
             wake: Notify::new(),
             up: watch::Sender::new(false),
+            asked: AtomicBool::new(false),
+            pongs: watch::Sender::new(0),
             next_call: AtomicU32::new(1),
             orders: PhantomData,
         }
@@ -193,6 +199,14 @@ impl<O: Order> Session<O> {
     /// between the two, would wait for ever.
     pub fn is_up(&self) -> bool {
         *self.up.borrow()
+    }
+
+    /// Asks the peer for a sign, and tells whether it gives one within `limit`, by whichever connection.
+    pub async fn is_there(&self, limit: Duration) -> bool {
+        let mut pongs = self.pongs.subscribe();
+        self.asked.store(true, Ordering::Relaxed);
+        self.wake.notify_one();
+        timeout(limit, pongs.changed()).await.is_ok()
     }
 
     /// The peer's clock against ours.

@@ -8,10 +8,11 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use link::SessionOptions;
+use futures_util::FutureExt;
 use link::control::{self, Exit, Hello, Node, Output, Welcome};
 use link::record::Data;
 use link::session::{receive_open, send_open};
+use link::{Lost, SessionOptions};
 use link::{MAX_FRAME, MAX_RECORD};
 use qos::{Side, Sla};
 use reach::links::{Hub, HubOptions, Nodes};
@@ -25,6 +26,7 @@ use ws::WebSocket;
 
 use super::diagnostics::Diagnostics;
 use super::*;
+use crate::farewell;
 use crate::local::tests::setting;
 use crate::testing::{SOON, World, read, stories, string, string_type, text, written};
 
@@ -33,12 +35,14 @@ stories! {
         who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before,
         the_node_is_connected_before_the_first_message_comes,
         newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
-        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back;
+        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back,
+        a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other;
     of_ros_2 = Two:
         who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before,
         the_node_is_connected_before_the_first_message_comes,
         newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
-        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back;
+        the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back,
+        a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other;
 }
 
 /// Nodes that run whatever happens.
@@ -135,11 +139,11 @@ impl Scene {
         written(self.ros, text)
     }
 
-    /// The link, until its task is aborted.
-    async fn links(&self) -> JoinHandle<()> {
+    /// The link, until its task is aborted; and the cloud's end of it.
+    async fn links(&self) -> (JoinHandle<Lost>, JoinHandle<Lost>) {
         let (theirs, ours) = tokio::io::duplex(1 << 16);
         let hub = Arc::clone(&self.hub);
-        tokio::spawn(async move { hub.serve(theirs, &[]).await });
+        let served = tokio::spawn(async move { hub.serve(theirs, &[]).await });
         let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
         let (_, _, next) = self.mirror.session().position();
         let hello = Hello {
@@ -165,10 +169,11 @@ impl Scene {
         };
         let mirror = self.mirror.clone();
         mirror.session().reconnect(received, &ahead, next);
-        tokio::spawn(async move {
+        let carried = tokio::spawn(async move {
             let session = mirror.session();
-            session.run(&mut socket, &*mirror).await;
-        })
+            session.run(&mut socket, &*mirror).await
+        });
+        (carried, served)
     }
 }
 
@@ -366,4 +371,49 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
     }
     let answer = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
     assert_eq!(read(ros, &answer), "cloud");
+}
+
+async fn a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other(ros: RosVersion) {
+    let term = nix::sys::signal::Signal::SIGTERM as i32;
+    let scene = Scene::new(ros, "/node").await;
+    let (link, left) = scene.links().await;
+    let mirror = &scene.mirror;
+    let mut up = mirror.session().up();
+    up.wait_for(|up| *up).await.unwrap();
+    // The node takes its time, and the cloud is there: it is waited for until something else ends that.
+    let (other, told) = tokio::sync::oneshot::channel::<()>();
+    let waiting = farewell::of_the_node(mirror, term, async { drop(told.await) });
+    tokio::pin!(waiting);
+    let patience = Duration::from_secs(3);
+    assert!(timeout(patience, &mut waiting).await.is_err(), "it ended");
+    drop(other);
+    assert!(timeout(SOON, waiting).await.expect("an end").is_none());
+    // The cloud is told that nobody comes back.
+    let linked = link.fuse();
+    timeout(SOON, farewell::of_all(mirror, linked, &[]))
+        .await
+        .expect("an end");
+    let lost = timeout(SOON, left).await.expect("an end").unwrap();
+    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+
+    let scene = Scene::new(ros, "/frozen").await;
+    let (_frozen, ours) = tokio::io::duplex(1 << 16);
+    let mirror = scene.mirror.clone();
+    let mut up = mirror.session().up();
+    let linked = tokio::spawn(async move {
+        let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
+        let session = mirror.session();
+        session.reconnect(0, &[], 1);
+        session.run(&mut socket, &*mirror).await
+    });
+    up.wait_for(|up| *up).await.unwrap();
+    let buses = [scene.mirror.bus.clone()];
+    let ending = async {
+        let told = farewell::of_the_node(&scene.mirror, term, std::future::pending()).await;
+        farewell::of_all(&scene.mirror, linked.fuse(), &buses).await;
+        told
+    };
+    // As launch has it before it sends a second signal.
+    let ended = timeout(Duration::from_secs(5), ending).await;
+    assert!(ended.expect("an end").is_none());
 }

@@ -2,6 +2,7 @@
 
 use std::future::{Future, poll_fn};
 use std::pin::{Pin, pin};
+use std::sync::atomic::Ordering;
 use std::task::Poll;
 use std::time::Duration;
 
@@ -135,6 +136,9 @@ impl<O: Order> Session<O> {
                     if let Some(reason) = self.state.lock().out.is_full() {
                         return Err(Lost::Full(reason.to_owned()));
                     }
+                    if self.asked.swap(false, Ordering::Relaxed) {
+                        connection.ping(self, socket);
+                    }
                 }
                 Event::Ended => return Err(Lost::Ended),
                 Event::Tick => {
@@ -235,6 +239,7 @@ impl<O: Order> Session<O> {
                     handler.clock(best);
                 }
                 connection.pongs += 1;
+                self.pongs.send_modify(|pongs| *pongs += 1);
                 if connection.pongs < FIRST_PINGS {
                     connection.ping(self, socket);
                 }

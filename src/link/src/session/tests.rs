@@ -128,6 +128,43 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
 }
 
 #[tokio::test]
+async fn a_peer_gives_a_sign_when_it_is_asked_for_one() {
+    let quiet = || {
+        let seldom = SessionOptions::for_silence(Duration::from_secs(600), None);
+        Arc::new(Session::new(SessionOptions {
+            ping: Duration::from_secs(600),
+            ..seldom
+        }))
+    };
+    let (robot, cloud) = (quiet(), quiet());
+    let nobody = To(mpsc::unbounded_channel().0);
+    let limit = Duration::from_millis(200);
+    assert!(!robot.is_there(limit).await, "there is no connection");
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    let asking = async {
+        // Those of the beginning are over.
+        while *robot.pongs.borrow() < 6 {
+            tokio::task::yield_now().await;
+        }
+        for _ in 0..3 {
+            assert!(robot.is_there(Duration::from_secs(60)).await);
+        }
+    };
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &nobody) => panic!("{lost}"),
+        lost = cloud.run(&mut at_cloud, &nobody) => panic!("{lost}"),
+        () = asking => {}
+    }
+    // A peer that holds the connection and says nothing.
+    let asked = async { robot.is_there(limit).await };
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &nobody) => panic!("{lost}"),
+        there = asked => assert!(!there),
+    }
+}
+
+#[tokio::test]
 async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
     let (robot, cloud) = (session(), session());
     for side in [&robot, &cloud] {
