@@ -390,6 +390,7 @@ fn main() -> ExitCode {
         stories![ros2:
             a_workspace_is_pushed_and_asked_by_rosbridge,
             two_programs_of_several_nodes_have_nodes_of_their_own_names,
+            nodes_stay_in_the_namespaces_that_their_programs_give_them,
             a_herald_in_the_cloud_is_a_node_of_the_robot,
             the_robot_s_graph_is_the_original_s,
             an_application_of_rclpy_asks_the_cloud,

@@ -113,6 +113,8 @@ fn services(sought: &[String]) -> String {
 pub struct ProbeOptions {
     /// Nodes that must register.
     pub nodes: Vec<String>,
+    /// Of those the ones that their programs may have put into a namespace (ROS 2), with the enclave by which they are known then.
+    pub marks: BTreeMap<String, String>,
     /// Which ROS it is; the bus knows.
     pub ros: RosVersion,
     /// Name of the looking node, which is no part of what it sees.
@@ -167,6 +169,7 @@ impl ProbeOptions {
     pub fn new(nodes: Vec<String>, own_name: &str) -> Self {
         Self {
             nodes,
+            marks: BTreeMap::new(),
             ros: RosVersion::One,
             own_name: own_name.to_owned(),
             patience: Duration::from_secs(60),
@@ -195,6 +198,8 @@ pub struct Found {
     pub warnings: Vec<String>,
     /// Outputs whose messages became longer and longer.
     pub growing: Vec<String>,
+    /// Nodes that their programs have put into a namespace, with the names that they have there.
+    pub moved: BTreeMap<String, String>,
 }
 
 /// Looks. `exited` resolves when a node ends that should not, with what is to be said about it.
@@ -229,11 +234,14 @@ async fn look(
         ..options.clone()
     };
     let mut watch = bus.graph();
-    settle::registered(&mut watch, options).await?;
-    tracing::debug!("probe: all nodes are registered");
+    let moved = settle::registered(&mut watch, options).await?;
+    tracing::debug!(?moved, "probe: all nodes are registered");
     let loaded = load_components(bus, registry, options).await?;
     let options = &ProbeOptions {
-        nodes: options.nodes.iter().cloned().chain(loaded).collect(),
+        nodes: {
+            let there = |node| moved.get(node).unwrap_or(node).clone();
+            options.nodes.iter().map(there).chain(loaded).collect()
+        },
         ..options.clone()
     };
     settle::registered(&mut watch, options).await?;
@@ -265,7 +273,8 @@ async fn look(
         outputs = look.tried.len(),
         "probe: all outputs are listened to"
     );
-    let bare = look.describe(&feed).await?;
+    let mut bare = look.describe(&feed).await?;
+    bare.moved = moved;
     tracing::debug!("probe: described as it is without a robot");
     // From here on a node may end of what it is given; then this is what is known of it.
     *unfed.lock() = Some(bare.clone());
@@ -289,6 +298,7 @@ async fn look(
         look.listen().await?;
         let before = std::mem::take(&mut found.interface);
         found = look.describe(&feed).await?;
+        found.moved.clone_from(&bare.moved);
         incomplete::keep_inputs(&mut found.interface, before);
         incomplete::mark_late(&mut found.interface, &bare.interface);
         *unfed.lock() = Some(found.clone());

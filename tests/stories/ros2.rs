@@ -105,6 +105,77 @@ pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict 
     Ok(())
 }
 
+pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
+    let daemon = world().shared()?;
+    let arguments = [
+        "--name",
+        "spotters",
+        "--node",
+        "spotter",
+        "--node",
+        "spotters",
+        "--node",
+        // As launch names a node.
+        "lookout --ros-args -r __node:=seeker",
+        "--param",
+        "~what=a cat",
+    ];
+    let push = daemon.deployer().pushes("spotter_ros2", &arguments)?;
+    push.succeeded()?;
+    let service = daemon.get_json("/api/v1/services/spotters")?;
+    let topics = service["interface"]["topics"].as_array();
+    let topics = topics.context("a list")?.iter();
+    let mut topics: Vec<&str> = topics.filter_map(|one| one["name"].as_str()).collect();
+    topics.sort();
+    let nodes = [
+        ("/camera", "detector"),
+        ("/left", "detector"),
+        ("/right", "detector"),
+        ("/tower", "seeker"),
+    ];
+    let all = nodes.map(|(above, _)| [format!("{above}/found"), format!("{above}/image")]);
+    ensure!(topics == all.concat(), "{service:#}");
+    let mut robot = daemon.robot("spotters?robot=asked")?;
+    for (above, name) in nodes {
+        let (image, found) = (format!("{above}/image"), format!("{above}/found"));
+        robot.subscribes(&found)?;
+        robot.says(json!({"op": "advertise", "topic": image, "type": "std_msgs/msg/String"}))?;
+        robot.says(json!({"op": "publish", "topic": image, "msg": {"data": "view"}}))?;
+        let heard = robot.hears_on(&found)?;
+        let expected = format!("a cat in view by {above}/{name}");
+        ensure!(heard["data"] == expected, "{heard}");
+    }
+    robot.leaves()?;
+    // On a robot: where its program is, unless a rule says otherwise.
+    let site = Site::of(RosVersion::Two)?;
+    let app = site.joins("/app")?;
+    let overlay = site.installs(&daemon, "spotters", "local = \"none\"\n")?;
+    let server = format!("ws://{}", daemon.address);
+    let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "spots")];
+    for (argv, above) in [
+        (&[][..], "/camera"),
+        (&["--ros-args", "-r", "__ns:=/front"], "/front"),
+    ] {
+        let mut stub = site.runs_among(&environment, &overlay, "spotter_ros2", "spotter", argv)?;
+        let node = format!("{above}/detector");
+        let images = site.says(&app, &format!("{above}/image"), false)?;
+        let mut finds = site.hears(&app, &format!("{above}/found"))?;
+        with_log(site.connected(&*images, 1), &stub)?;
+        with_log(site.fed(&finds, 1), &stub)?;
+        images.publish(string_of(WireFormat::Cdr, "view"));
+        let found = with_log(site.next(&mut finds), &stub)?;
+        let words = format!("a cat in view by {node}");
+        ensure!(
+            contains(&found.bytes, &words) && found.publisher.node() == node,
+            "{found:?}\n{}",
+            stub.said()
+        );
+        stub.signal(Signal::SIGINT)?;
+        stub.ends()?;
+    }
+    Ok(())
+}
+
 /// The definition of the herald's action.
 fn count() -> anyhow::Result<Arc<ActionDef>> {
     let registry = Registry::of(RosVersion::Two);

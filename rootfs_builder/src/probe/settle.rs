@@ -15,24 +15,26 @@ async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeErr
     watch.changed().await.map_err(|_| ProbeError::MasterGone)
 }
 
-/// Waits until all nodes that must register have.
+/// Waits until all nodes that must register have; those that are elsewhere, with their names there.
 pub(super) async fn registered(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
-) -> Result<(), ProbeError> {
+) -> Result<BTreeMap<String, String>, ProbeError> {
     let deadline = Instant::now() + options.patience;
     loop {
-        let missing: Vec<String> = {
+        let (mut missing, mut moved) = (Vec::new(), BTreeMap::new());
+        {
             let graph = watch.borrow_and_update();
-            options
-                .nodes
-                .iter()
-                .filter(|node| !graph.nodes.contains_key(*node))
-                .cloned()
-                .collect()
-        };
+            let nodes = options.nodes.iter();
+            for node in nodes.filter(|node| !graph.nodes.contains_key(*node)) {
+                match elsewhere(&graph, node, options) {
+                    Some(there) => drop(moved.insert(node.clone(), there.clone())),
+                    None => missing.push(node.clone()),
+                }
+            }
+        }
         if missing.is_empty() {
-            return Ok(());
+            return Ok(moved);
         }
         match timeout_at(deadline, changed(watch)).await {
             Ok(result) => result?,
@@ -48,6 +50,13 @@ pub(super) async fn registered(
             }
         }
     }
+}
+
+/// Where a node is that its program has put into a namespace: the one of its name among those of its mark.
+fn elsewhere<'a>(graph: &'a Graph, node: &str, options: &ProbeOptions) -> Option<&'a String> {
+    let last = |name: &str| name.rsplit('/').next().map(str::to_owned);
+    let nodes = graph.enclaves.get(options.marks.get(node)?)?;
+    nodes.iter().find(|other| last(other) == last(node))
 }
 
 /// Time as nodes have it: while they wait for a core it stands still, nearly.
@@ -221,4 +230,42 @@ pub(super) fn shape(graph: &Graph) -> Shape {
         graph.parameters.len(),
         graph.sought.len(),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_node_that_its_program_puts_elsewhere_is_known_by_its_mark() {
+        let nodes = |names: &[&str]| {
+            let names = names.iter();
+            names
+                .map(|&name| (name.to_owned(), String::new()))
+                .collect()
+        };
+        let beside = ["/hear", "/other/see", "/rear/hear"];
+        let graph = Graph {
+            nodes: nodes(&beside),
+            enclaves: [("/other".to_owned(), ["/other/see".to_owned()].into())].into(),
+            ..Graph::default()
+        };
+        let (sender, mut watch) = watch::channel(Arc::new(graph.clone()));
+        let options = ProbeOptions {
+            patience: Duration::from_millis(100),
+            marks: [("/see".to_owned(), "/mark".to_owned())].into(),
+            ..ProbeOptions::new(vec!["/see".to_owned(), "/hear".to_owned()], "/probe")
+        };
+        let error = registered(&mut watch, &options).await.expect_err("no /see");
+        assert!(error.to_string().starts_with("/see did not"), "{error}");
+        let of_mark = ["/camera/help".to_owned(), "/camera/see".to_owned()];
+        sender.send_replace(Arc::new(Graph {
+            nodes: nodes(&[&beside[..], &["/camera/help", "/camera/see"]].concat()),
+            enclaves: [("/mark".to_owned(), of_mark.into())].into(),
+            ..graph
+        }));
+        let moved = registered(&mut watch, &options).await.expect("both");
+        let expected = ("/see".to_owned(), "/camera/see".to_owned());
+        assert_eq!(moved, [expected].into());
+    }
 }

@@ -13,6 +13,7 @@ use package::stub::{
     manifest,
 };
 use ros::bus::RosVersion;
+use ros::ros2::arguments;
 use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
@@ -133,7 +134,8 @@ pub fn files(
 }
 
 /// What nodes of ROS 2 are called by their programs, where each runs once: a robot's launch files seldom name its nodes, and
-/// parameters files go by what those are called. ROS 1's always name them.
+/// parameters files go by what those are called. With the namespace where the program gives one (`/camera/detector`), and not where the push has:
+/// a robot has its own. ROS 1's always name them.
 fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
     let mut names = BTreeMap::new();
     if revision.flavour.ros.bus() == RosVersion::One {
@@ -143,7 +145,11 @@ fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, S
         let nodes = revision.plan.nodes.iter();
         let mut nodes = nodes.filter(|node| node.argv.contains(path));
         if let (Some(node), None) = (nodes.next(), nodes.next()) {
-            let name = node.name.rsplit('/').next().unwrap_or(&node.name);
+            let name = match node.name.rsplit_once('/') {
+                Some(("", name)) => name,
+                Some((_, name)) if arguments::gives_namespace(&node.argv) => name,
+                _ => &node.name,
+            };
             names.insert(program.clone(), name.to_owned());
         }
     }
@@ -301,6 +307,12 @@ mod tests {
             respawn_delay: 0.0,
             required: false,
         };
+        let put = |namespace: &str, name: &str, program: &str| {
+            let mut node = node(&format!("{namespace}/{name}"), program);
+            let rule = format!("__ns:={namespace}");
+            node.argv.extend(["--ros-args".into(), "-r".into(), rule]);
+            node
+        };
         let mut revision = RevisionRecord {
             service: "s".into(),
             number: 1,
@@ -314,7 +326,8 @@ mod tests {
             },
             plan: Plan {
                 nodes: vec![
-                    node("/front/camera", "/opt/p/lib/p/camera_node"),
+                    put("/front", "camera", "/opt/p/lib/p/camera_node"),
+                    node("/arm/gripper", "/opt/p/lib/p/gripper"),
                     node("/left", "/opt/p/lib/p/wheel"),
                     node("/right", "/opt/p/lib/p/wheel"),
                 ],
@@ -323,13 +336,14 @@ mod tests {
             interface: Interface::default(),
         };
         let inventory = Inventory {
-            programs: ["camera_node", "wheel"]
+            programs: ["camera_node", "gripper", "wheel"]
                 .map(|name| (name.to_owned(), format!("/opt/p/lib/p/{name}")))
                 .into(),
             ..Inventory::default()
         };
         // What runs twice says nothing of its own name.
-        let expected = [("camera_node".to_owned(), "camera".to_owned())];
+        let expected = [("camera_node", "camera"), ("gripper", "/arm/gripper")];
+        let expected = expected.map(|(program, node)| (program.to_owned(), node.to_owned()));
         assert_eq!(names(&revision, &inventory), expected.into());
         revision.flavour.ros = Version::Ros1;
         assert!(names(&revision, &inventory).is_empty());

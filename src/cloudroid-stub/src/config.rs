@@ -35,7 +35,8 @@
 //! stateful = false     # the local original takes over only while the link is down
 //! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time, or
 //! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
-//! # The name that an executable's node has when none is given, where that is not the executable's.
+//! # The name that an executable's node has when none is given, where that is not the executable's; in ROS 2 with a namespace
+//! # ("/camera/listener") where the program gives it one.
 //! nodes = { "listener.py" = "listener" }
 //!
 //! # What the node in the cloud is to get, stated to the server with desire and max, or what else is promised:
@@ -185,7 +186,7 @@ pub struct Config {
     /// Quality of JPEG pictures, 1 to 100.
     #[serde(default)]
     pub quality: Option<f64>,
-    /// Executable → the name its node has when none is given.
+    /// Executable → the name its node has when none is given; in ROS 2 also with a namespace.
     #[serde(default)]
     pub nodes: BTreeMap<String, String>,
 }

@@ -1,7 +1,7 @@
 //! What nodes are called that were told no name (`--node`): what their programs say, as under rosrun.
 //!
 //! The name is known only when a program runs, and parameters must be there before it does. So it is started once, each
-//! node in a namespace of its own to tell it by, and ended as soon as it has registered. From then on it is told that
+//! program with a mark of its own to tell its nodes by, and ended as soon as it has registered. From then on it is told that
 //! name: one with a random end (an anonymous node's) would be another each time.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,7 +14,7 @@ use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::{ProbeError, ProbeOptions, still};
 use ros::bus::{Graph, ParamValue, RosVersion};
-use ros::flavour::Flavour;
+use ros::flavour::{Called, Flavour};
 use ros::plumbing;
 use ros::ros2::composition::Component;
 use servant::engine::Servant;
@@ -36,8 +36,8 @@ const MORE_NODES: Duration = Duration::from_secs(2);
 /// Parameters that a warning names.
 const NAMED: usize = 12;
 
-/// Where the node of an index is while its name is looked for.
-fn namespace(index: usize) -> String {
+/// What the nodes of an index are marked by while their names are looked for.
+fn mark_of(index: usize) -> String {
     format!("/cloudroid_name_{index}")
 }
 
@@ -63,9 +63,9 @@ pub(super) async fn settle(
         .iter()
         .map(|index| {
             let mut node = plan.nodes[*index].clone();
-            let put = built.flavour.namespace(&namespace(*index));
-            built.flavour.put(put.arguments, &mut node.argv);
-            node.environment.extend(put.environment);
+            let marked = built.flavour.marked(&mark_of(*index));
+            node.argv.extend(marked.arguments);
+            node.environment.extend(marked.environment);
             node
         })
         .collect();
@@ -79,8 +79,8 @@ pub(super) async fn settle(
     Ok(())
 }
 
-/// Names of a program's nodes, the first by name first.
-type Names = BTreeMap<usize, Vec<String>>;
+/// What programs call their nodes, by index; the first by name first.
+type Names = BTreeMap<usize, Vec<Called>>;
 
 /// Names by index, as far as they could be found; those of nodes that end at once stay unknown.
 async fn look(
@@ -115,7 +115,7 @@ async fn look(
             NODE,
         )
     };
-    let all_there = |graph: &Arc<Graph>| names(graph, unnamed, host).len() == unnamed.len();
+    let all_there = |graph: &Arc<Graph>| names(ros, graph, unnamed, host).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
         // What it says of itself is told when it is started again, with its parameters.
@@ -126,7 +126,7 @@ async fn look(
             registered => registered,
         },
     };
-    let found = names(&seen.borrow(), unnamed, host);
+    let found = names(ros, &seen.borrow(), unnamed, host);
     looked.bus.close().await;
     match registered {
         Ok(()) => Ok(found),
@@ -159,32 +159,51 @@ async fn registered(
     Ok(())
 }
 
-/// Which nodes of the graph are whose: their names without namespace, or an absolute one where its program has chosen the namespace itself. `host`: the
-/// name of the machine that they think they run on.
-fn names(graph: &Graph, unnamed: &[usize], host: &str) -> Names {
+/// Which nodes of the graph are whose: their absolute names in ROS 2; those below their namespace in ROS 1, where nobody else gives one. `host`: the name
+/// of the machine that they think they run on.
+fn names(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> Names {
     let mut names = Names::new();
     for index in unnamed {
-        let below = format!("{}/", namespace(*index));
-        let own = graph.nodes.keys();
-        let mut said: Vec<&str> = own
-            .filter_map(|node| node.strip_prefix(below.as_str()))
-            .collect();
-        // A program may choose its namespace itself; alone it is known all the same.
+        let mark = mark_of(*index);
+        let mut said: Vec<&str> = match ros {
+            RosVersion::One => {
+                let all = graph.nodes.keys();
+                all.filter_map(|node| node.strip_prefix(&*mark)?.strip_prefix('/'))
+                    .collect()
+            }
+            RosVersion::Two => {
+                let own = graph.enclaves.get(&mark).into_iter().flatten();
+                own.map(String::as_str).collect()
+            }
+        };
+        // A program may take no notice of its mark; alone it is known all the same.
         if said.is_empty() && unnamed.len() == 1 {
-            let only = graph.nodes.keys().find(|node| *node != NODE);
-            said.extend(only.map(String::as_str));
+            let others = graph.nodes.keys().filter(|node| *node != NODE);
+            said.extend(others.map(String::as_str));
         }
         // What a program registers is untrusted.
-        let said = said
-            .into_iter()
-            .map(|name| without_host(without_random_end(name), host))
-            .filter(|name| is_graph_name(&format!("/{}", name.trim_start_matches('/'))));
-        let said: Vec<String> = said.collect();
-        if !said.is_empty() {
-            names.insert(*index, said);
+        let called = said.into_iter().map(|own| called(own, host));
+        let known =
+            |called: &Called| is_graph_name(&format!("/{}", called.node.trim_start_matches('/')));
+        let mut called: Vec<Called> = called.filter(known).collect();
+        // No rule fits one among several whose name is another each time.
+        if called.iter().any(|called| called.own.is_some()) {
+            called.retain(|called| called.own.is_some());
+        }
+        if !called.is_empty() {
+            names.insert(*index, called);
         }
     }
     names
+}
+
+/// A node by the name that its program has given it, which may have parts that are others each time.
+fn called(own: &str, host: &str) -> Called {
+    let without = without_host(without_random_end(own), host);
+    Called {
+        own: (without == own).then(|| own.to_owned()),
+        node: without,
+    }
 }
 
 /// The name of an anonymous node without what makes it unique: `_PID_MILLISECONDS` (rospy), `_NANOSECONDS` (roscpp).
@@ -210,14 +229,25 @@ fn without_random_end(name: &str) -> &str {
 fn without_host(name: &str, host: &str) -> String {
     // A hyphen is not allowed in a node's name.
     let host = host.replace('-', "_");
-    match name.split_once(host.as_str()) {
-        Some((before, after)) if !host.is_empty() => {
+    if host.is_empty() || !name.contains(&host) {
+        return name.to_owned();
+    }
+    let part = |part: &str| match part.split_once(host.as_str()) {
+        Some((before, after)) => {
             let parts = [before.trim_end_matches('_'), after.trim_start_matches('_')];
             let parts: Vec<&str> = parts.into_iter().filter(|part| !part.is_empty()).collect();
             parts.join("_")
         }
-        _ => name.to_owned(),
-    }
+        None => part.to_owned(),
+    };
+    let parts: Vec<String> = name.split('/').map(part).collect();
+    // A namespace of which nothing is left is none; what an absolute name begins with stays.
+    let left = parts
+        .iter()
+        .enumerate()
+        .filter(|(at, part)| *at == 0 || !part.is_empty());
+    let left: Vec<&str> = left.map(|(_, part)| part.as_str()).collect();
+    left.join("/")
 }
 
 /// Writes names into the plan, and moves private parameters there. A node whose name is not known is told the guess.
@@ -238,23 +268,21 @@ fn apply(
     for index in unnamed {
         let guess = plan.nodes[*index].name.clone();
         let above = guess.rsplit_once('/').map_or("", |(above, _)| above);
-        let mut called = Vec::new();
-        for known in found.get(index).into_iter().flatten() {
-            let wanted = match known.starts_with('/') {
-                true => known.clone(),
-                false => format!("{above}/{known}"),
-            };
-            let own = known.rsplit('/').next().unwrap_or(known);
-            called.push((own.to_owned(), free(wanted, &mut taken)));
-        }
-        let (name, identity) = match called.first() {
-            Some((_, first)) => (first.clone(), flavour.renamed(&called)),
-            None => {
-                let name = free(guess.clone(), &mut taken);
-                let identity = flavour.identity(&name);
-                (name, identity)
+        let mut called = found.get(index).cloned().unwrap_or_default();
+        for called in &mut called {
+            if !called.node.starts_with('/') {
+                called.node = format!("{above}/{}", called.node);
             }
-        };
+        }
+        free(&mut called, &mut taken);
+        if called.is_empty() {
+            called.push(Called {
+                own: None,
+                node: guess.clone(),
+            });
+            free(&mut called, &mut taken);
+        }
+        let (name, identity) = (called[0].node.clone(), flavour.renamed(&called));
         for key in options.params.keys().filter(|key| !key.starts_with('/')) {
             let bare = key.trim_start_matches(['~', '_']);
             if let Some(value) = plan.parameters.remove(&format!("{guess}/{bare}")) {
@@ -269,15 +297,28 @@ fn apply(
     }
 }
 
-/// Takes a name, with a number where it is taken.
-fn free(wanted: String, taken: &mut BTreeSet<String>) -> String {
-    let mut name = wanted.clone();
-    let mut number = 1;
-    while !taken.insert(name.clone()) {
-        number += 1;
-        name = format!("{wanted}_{number}");
+/// Takes the names of a program's nodes, with a number where one is taken: the same one for all of its nodes of one name, for which there is one rule,
+/// whatever their namespaces.
+fn free(called: &mut [Called], taken: &mut BTreeSet<String>) {
+    let wanted: Vec<String> = called.iter().map(|called| called.node.clone()).collect();
+    let last = |name: &str| {
+        name.rsplit_once('/')
+            .map_or(0, |(above, _)| above.len() + 1)
+    };
+    let numbered = |name: &str, number: usize| match number {
+        1 => name.to_owned(),
+        _ => format!("{name}_{number}"),
+    };
+    for (called, name) in called.iter_mut().zip(&wanted) {
+        let same = |other: &&String| other[last(other)..] == name[last(name)..];
+        let fits = |number: &usize| {
+            let mut same = wanted.iter().filter(same);
+            same.all(|other| !taken.contains(&numbered(other, *number)))
+        };
+        let number = (1..).find(fits).unwrap_or(1);
+        called.node = numbered(name, number);
     }
-    name
+    taken.extend(called.iter().map(|called| called.node.clone()));
 }
 
 /// Tells a node its parameters, where nodes hold their own; not again what it was told before (a node of an exported service).
@@ -293,6 +334,34 @@ pub(super) fn tell_parameters(
     };
     if !arguments.is_empty() && !told(&node.argv) {
         node.argv.extend(arguments);
+    }
+}
+
+/// Marks the nodes that were told a name and no namespace (by a launch file, say): their programs may give them one. Marks by name.
+pub(super) fn mark(plan: &mut Plan, flavour: &Flavour) -> BTreeMap<String, String> {
+    let nodes = plan.nodes.iter_mut().enumerate();
+    let free = nodes.filter(|(_, node)| flavour.may_choose_namespace(&node.argv));
+    free.map(|(index, node)| {
+        let mark = mark_of(index);
+        node.argv.extend(flavour.marked(&mark).arguments);
+        (node.name.clone(), mark)
+    })
+    .collect()
+}
+
+/// Nodes are where their programs have put them, and their parameters with them.
+pub(super) fn place(plan: &mut Plan, moved: &BTreeMap<String, String>) {
+    for (name, there) in moved {
+        for node in plan.nodes.iter_mut().filter(|node| node.name == *name) {
+            node.name.clone_from(there);
+        }
+        let parameters = std::mem::take(&mut plan.parameters).into_iter();
+        plan.parameters = parameters
+            .map(|(key, value)| match key.strip_prefix(&**name) {
+                Some(rest) if rest.starts_with('/') => (format!("{there}{rest}"), value),
+                _ => (key, value),
+            })
+            .collect();
     }
 }
 
@@ -363,217 +432,4 @@ fn undeclared(interface: &Interface, key: &str) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use package::interface::Parameter;
-
-    fn plan(names: &[&str]) -> Plan {
-        let node = |name: &&str| NodeSpec {
-            name: (*name).to_owned(),
-            argv: vec!["/x".to_owned()],
-            environment: Default::default(),
-            directory: "/root".to_owned(),
-            respawn: false,
-            respawn_delay: 0.0,
-            required: false,
-        };
-        Plan {
-            nodes: names.iter().map(node).collect(),
-            ..Plan::default()
-        }
-    }
-
-    fn given(params: &[&str]) -> PushOptions {
-        PushOptions {
-            params: params
-                .iter()
-                .map(|key| ((*key).to_owned(), serde_json::json!(1)))
-                .collect(),
-            ..PushOptions::default()
-        }
-    }
-
-    fn found(said: &[(usize, &[&str])]) -> Names {
-        let said = said.iter().map(|(index, names)| {
-            let names = names.iter().map(|&name| name.to_owned());
-            (*index, names.collect())
-        });
-        said.collect()
-    }
-
-    #[test]
-    fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
-        let mut plan = plan(&["/costmap_2d_node", "/other", "/third"]);
-        let options = given(&["~rate", "/costmap_2d_node/stays"]);
-        for key in ["/costmap_2d_node/rate", "/costmap_2d_node/stays"] {
-            plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
-        }
-        let found = found(&[(0, &["costmap_2d"]), (2, &["other"])]);
-        apply(&mut plan, &Flavour::default(), &[0, 2], &found, &options);
-        let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
-        assert_eq!(names, ["/costmap_2d", "/other", "/other_2"]);
-        assert_eq!(plan.nodes[0].argv, ["/x", "__name:=costmap_2d"]);
-        let keys: Vec<&String> = plan.parameters.keys().collect();
-        assert_eq!(keys, ["/costmap_2d/rate", "/costmap_2d_node/stays"]);
-        let words = unused(&plan, &Interface::default(), &options).join("\n");
-        assert!(
-            words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"),
-            "{words}"
-        );
-        // Somebody may read it all the same.
-        let interface = Interface {
-            parameters: vec![Parameter {
-                name: "/costmap_2d_node/stays".to_owned(),
-                read_by: vec!["/other".to_owned()],
-                ..Parameter::default()
-            }],
-            ..Interface::default()
-        };
-        assert!(unused(&plan, &interface, &options).is_empty());
-    }
-
-    #[test]
-    fn nodes_of_ros_2_keep_their_namespaces_and_are_renamed_alone() {
-        let flavour = Flavour {
-            ros: ros::flavour::Version::Ros2,
-            ..Flavour::default()
-        };
-        let mut plan = plan(&["/front/talk", "/back/talk", "/two", "/own"]);
-        for (node, namespace) in plan.nodes.iter_mut().zip(["/front", "/back"]) {
-            let words = ["--ros-args", "-r", &*format!("__ns:={namespace}")];
-            node.argv.extend(words.map(str::to_owned));
-        }
-        let said = found(&[
-            (0, &["talker"]),
-            (1, &["talker"]),
-            (2, &["own"]),
-            (3, &["/chosen/own"]),
-        ]);
-        let given = PushOptions::default();
-        apply(&mut plan, &flavour, &[0, 1, 2, 3], &said, &given);
-        let told = |index: usize| {
-            let node: &NodeSpec = &plan.nodes[index];
-            (node.name.as_str(), node.argv.join(" "))
-        };
-        let kept = |namespace: &str| format!("/x --ros-args -r __ns:={namespace}");
-        assert_eq!(told(0), ("/front/talker", kept("/front")));
-        assert_eq!(told(1), ("/back/talker", kept("/back")));
-        assert_eq!(told(2), ("/own", "/x".to_owned()));
-        assert_eq!(told(3), ("/chosen/own", "/x".to_owned()));
-    }
-
-    #[test]
-    fn each_node_of_a_second_program_of_several_nodes_has_a_name_of_its_own() {
-        let flavour = Flavour {
-            ros: ros::flavour::Version::Ros2,
-            ..Flavour::default()
-        };
-        let mut twice = plan(&["/duet", "/duet_2", "/soloist"]);
-        let key = |name: &str| format!("{name}/rate");
-        for name in ["/duet", "/duet_2", "/soloist"] {
-            twice.parameters.insert(key(name), ParamValue::Int(1));
-        }
-        let said = found(&[
-            (0, &["alto", "tenor"]),
-            (1, &["alto", "tenor"]),
-            (2, &["solo", "tenor"]),
-        ]);
-        apply(&mut twice, &flavour, &[0, 1, 2], &said, &given(&["rate"]));
-        let rate = ["--ros-args", "-p", "rate:=1", "--"];
-        let told = |index: usize| {
-            let argv = &twice.nodes[index].argv;
-            let rules = argv.len() - rate.len();
-            assert_eq!(argv[rules..], rate);
-            (&*twice.nodes[index].name, argv[..rules].join(" "))
-        };
-        assert_eq!(told(0), ("/alto", "/x".to_owned()));
-        let rules = "/x --ros-args -r alto:__node:=alto_2 -r tenor:__node:=tenor_2";
-        assert_eq!(told(1), ("/alto_2", rules.to_owned()));
-        let rules = "/x --ros-args -r tenor:__node:=tenor_3";
-        assert_eq!(told(2), ("/solo", rules.to_owned()));
-        let keys: Vec<&String> = twice.parameters.keys().collect();
-        assert_eq!(keys, ["/alto/rate", "/alto_2/rate", "/solo/rate"]);
-    }
-
-    #[test]
-    fn parameters_that_no_node_of_ros_2_has_declared_are_told() {
-        let own = |name: &str| Parameter {
-            name: format!("/see/{name}"),
-            node: "/see".to_owned(),
-            ..Parameter::default()
-        };
-        let interface = Interface {
-            parameters: vec![own("rate"), own("camera.width")],
-            ..Interface::default()
-        };
-        for known in [
-            "rate",
-            "~rate",
-            "/rate",
-            "/see/rate",
-            "/see/camera/width",
-            "camera/width",
-            "camera",
-            "use_sim_time",
-        ] {
-            assert_eq!(undeclared(&interface, known), None, "{known}");
-        }
-        for unknown in ["rat", "/see/rat", "/other/rate/x", "width"] {
-            let words = undeclared(&interface, unknown).expect(unknown);
-            assert_eq!(words, "there are /see/rate, /see/camera.width");
-        }
-        // Nodes of ROS 1 declare nothing.
-        assert_eq!(undeclared(&Interface::default(), "rat"), None);
-    }
-
-    #[test]
-    fn nodes_are_told_apart_by_their_namespaces() {
-        let graph = Graph {
-            nodes: [
-                "/cloudroid_name_0/costmap_2d",
-                "/cloudroid_name_0/below/planner",
-                "/cloudroid_name_3/talker_71_1700000000123",
-                "/cloudroid_name_4/x'$(cmd)'",
-                "/cloudroid_name_5/cpu_monitor_push_1_names",
-                NODE,
-            ]
-            .map(|name| (name.to_owned(), String::new()))
-            .into(),
-            ..Graph::default()
-        };
-        assert_eq!(
-            names(&graph, &[0, 3, 4, 5], "push-1-names"),
-            found(&[
-                (0, &["below/planner", "costmap_2d"]),
-                (3, &["talker"]),
-                (5, &["cpu_monitor"]),
-            ])
-        );
-    }
-
-    #[test]
-    fn the_machine_is_no_part_of_a_name() {
-        for (name, plain) in [
-            ("cpu_monitor_push_1_names", "cpu_monitor"),
-            ("push_1_names_ntp", "ntp"),
-            ("a_push_1_names_b", "a_b"),
-            ("push_1_names", ""),
-            ("push_1", "push_1"),
-        ] {
-            assert_eq!(without_host(name, "push-1-names"), plain);
-        }
-    }
-
-    #[test]
-    fn random_ends_are_cut_off() {
-        for (name, plain) in [
-            ("talker_4711_1700000000123", "talker"),
-            ("people_detect_1700000000123456789", "people_detect"),
-            ("node_1_1700000000123456789", "node_1"),
-            ("costmap_2d", "costmap_2d"),
-            ("camera_2", "camera_2"),
-        ] {
-            assert_eq!(without_random_end(name), plain);
-        }
-    }
-}
+mod tests;

@@ -1,5 +1,6 @@
 //! Finds the interface of a new image: it is started once, as a servant, and looked at.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -77,18 +78,20 @@ async fn shown(
     alive: &Alive,
 ) -> Result<Found, Error> {
     naming::settle(pusher, id, built, plan, options, alive).await?;
-    let plan = &*plan;
-    let spec = self::spec(pusher, id, built, plan, options);
+    let mut marked = plan.clone();
+    let marks = naming::mark(&mut marked, &built.flavour);
+    let spec = self::spec(pusher, id, built, &marked, options);
     let (servant, trial) = start(pusher, spec, alive).await?;
     let unmet = servant
         .enforced()
         .unmet(&choreographer::engine_limits(&options.limits));
-    let found = look(pusher, &servant, built, plan, options).await;
+    let found = look(pusher, &servant, built, plan, marks, options).await;
     trial.end().await?;
     let mut found = match found {
         Ok(found) => found,
         Err(error) => return Err(advised(pusher, built, error).await),
     };
+    naming::place(plan, &found.moved);
     let unused = naming::unused(plan, &found.interface, options);
     found.warnings.extend(unused);
     let warn = |what| format!("servants will run without a limit that was asked for: {what}");
@@ -146,6 +149,7 @@ async fn look(
     servant: &Arc<dyn Servant>,
     built: &BuildOutcome,
     plan: &Plan,
+    marks: BTreeMap<String, String>,
     push: &PushOptions,
 ) -> Result<Found, Error> {
     let failed = |message: String| Error::Failed {
@@ -163,6 +167,7 @@ async fn look(
             .map(supplement::topic_types)
             .unwrap_or_default(),
         components: plan.components.clone(),
+        marks,
         work: Some(work(servant)),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),

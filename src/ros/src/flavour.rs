@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::bus::{ParamValue, RosVersion};
-pub use crate::identity::Identity;
+pub use crate::identity::{Called, Identity};
 use crate::{ros1, ros2};
 
 /// The base that an image is built upon, and its ROS.
@@ -77,13 +77,13 @@ impl Flavour {
         }
     }
 
-    /// What calls a program's nodes by absolute names: what each calls itself (without namespace), and what it is called. In ROS 1 a program is one
-    /// node, the first; in ROS 2 it may be several, and one that is called so already is told nothing.
-    pub fn renamed(&self, nodes: &[(String, String)]) -> Identity {
+    /// What calls a program's nodes by absolute names. In ROS 1 a program is one node, the first; in ROS 2 it may be several, and one that is
+    /// called so already is told nothing.
+    pub fn renamed(&self, nodes: &[Called]) -> Identity {
         match self.ros {
             Version::Ros1 => nodes
                 .first()
-                .map(|(_, node)| ros1::process::identity(node))
+                .map(|called| ros1::process::identity(&called.node))
                 .unwrap_or_default(),
             Version::Ros2 => ros2::process::renamed(nodes),
         }
@@ -99,12 +99,18 @@ impl Flavour {
         argv.splice(at..at, arguments);
     }
 
-    /// What puts a program that chooses its name itself into a namespace.
-    pub fn namespace(&self, namespace: &str) -> Identity {
+    /// What marks the nodes of a program, so that its own are known in the graph, whatever their names: a namespace in ROS 1, where programs have none
+    /// of their own; an enclave in ROS 2, where one would hide theirs. At the end of a command line it counts. `mark`: an absolute name.
+    pub fn marked(&self, mark: &str) -> Identity {
         match self.ros {
-            Version::Ros1 => ros1::process::namespace(namespace),
-            Version::Ros2 => ros2::process::namespace(namespace),
+            Version::Ros1 => ros1::process::namespace(mark),
+            Version::Ros2 => ros2::process::in_enclave(mark),
         }
+    }
+
+    /// Whether a program may give its nodes a namespace, which this command line does not say.
+    pub fn may_choose_namespace(&self, argv: &[String]) -> bool {
+        self.ros == Version::Ros2 && !ros2::arguments::gives_namespace(argv)
     }
 
     /// Arguments that give the node of this absolute name its parameters, where nodes hold their own (ROS 2); more of them may

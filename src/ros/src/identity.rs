@@ -10,3 +10,12 @@ pub struct Identity {
     /// To be added to its environment.
     pub environment: BTreeMap<String, String>,
 }
+
+/// What a node of a program is called.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Called {
+    /// What its program calls it, with a namespace that the program gives it; none where that is another name each time.
+    pub own: Option<String>,
+    /// Its absolute name.
+    pub node: String,
+}

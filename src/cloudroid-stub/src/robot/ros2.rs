@@ -19,10 +19,11 @@ const ALL: &str = "/**";
 /// A file of this robot, by which rcl's logging is set.
 const LOG_CONFIG_FILE: &str = "--log-config-file";
 
-/// As [`Robot::read`].
+/// As [`Robot::read`]. `usual` has a namespace (`/camera/detector`) where the program gives its node one.
 pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<Robot> {
     let parts = arguments::parse(argv)?;
-    let (name, node) = named(&parts, usual)?;
+    let (above, usual) = usual.rsplit_once('/').unwrap_or(("", usual));
+    let (name, node) = named(&parts, above, usual)?;
     let sections = sections(&parts)?;
     let parameters = sections.of(&node);
     let (id, network) = network::network(variable).await?;
@@ -37,8 +38,8 @@ pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyho
     })
 }
 
-/// The node's name, and with its namespace. Of several rules the first one counts.
-fn named(parts: &[Part], usual: &str) -> anyhow::Result<(String, String)> {
+/// The node's name, and with its namespace. Of several rules the first one counts; what the program says, where there is none.
+fn named(parts: &[Part], above: &str, usual: &str) -> anyhow::Result<(String, String)> {
     let of = |renamed: Renamed, node: &str| {
         let rules = parts.iter().filter_map(rule);
         let mut rules = rules.filter(|rule| rule.of == renamed && rule.concerns(node));
@@ -46,11 +47,11 @@ fn named(parts: &[Part], usual: &str) -> anyhow::Result<(String, String)> {
     };
     let name = of(Renamed::Node, usual).unwrap_or_else(|| usual.to_owned());
     // rcl looks for the namespace of the name that it has found.
-    let namespace = of(Renamed::Namespace, &name).unwrap_or_default();
+    let namespace = of(Renamed::Namespace, &name).unwrap_or_else(|| above.to_owned());
     let node = format!("{}/{name}", namespace.trim_end_matches('/'));
     if !names::is_global(&node) {
         bail!(
-            "{node:?} is not a name that ROS 2 allows for a node; set nodes = {{ \"EXECUTABLE\" = \"NAME\" }} in stub.toml, or give --ros-args -r __node:=NAME"
+            "{node:?} is not a name that ROS 2 allows for a node; set nodes = {{ \"EXECUTABLE\" = \"NAME\" }} (or \"/NAMESPACE/NAME\") in stub.toml, or give --ros-args -r __node:=NAME"
         );
     }
     Ok((name, node))
@@ -147,6 +148,11 @@ mod tests {
     use super::*;
 
     async fn read(line: &str) -> anyhow::Result<Robot> {
+        read_of("usual", line).await
+    }
+
+    /// Of a program that calls its node so.
+    async fn read_of(usual: &str, line: &str) -> anyhow::Result<Robot> {
         let argv: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
         let variable = |name: &str| match name {
             "ROS_DOMAIN_ID" => Some("7".to_owned()),
@@ -155,7 +161,7 @@ mod tests {
             "ROS_NAMESPACE" => Some("/ignored".to_owned()),
             _ => None,
         };
-        super::read(&argv, "usual", &variable).await
+        super::read(&argv, usual, &variable).await
     }
 
     #[tokio::test]
@@ -180,6 +186,27 @@ mod tests {
             "{robot:?}"
         );
         assert!(robot.argv.is_empty() && robot.original_argv.is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_namespace_that_the_program_gives_is_replaced_by_rules() {
+        for (line, node) in [
+            ("", "/camera/usual"),
+            ("--ros-args -r __node:=a", "/camera/a"),
+            ("--ros-args -r __ns:=/front", "/front/usual"),
+            ("--ros-args -r __ns:=/", "/usual"),
+            ("--ros-args -r usual:__ns:=/front", "/front/usual"),
+            ("--ros-args -r other:__ns:=/front", "/camera/usual"),
+        ] {
+            let robot = read_of("/camera/usual", line).await.expect(line);
+            assert_eq!(robot.node, node, "{line}");
+            let expected = match line.contains("other") {
+                true => line.split(' ').chain(["--"]).collect(),
+                false => Vec::new(),
+            };
+            assert_eq!(robot.argv, expected, "{line}");
+        }
+        assert!(read_of("camera/usual", "").await.is_err());
     }
 
     #[tokio::test]

@@ -1,6 +1,6 @@
 //! Nodes, and what they have registered.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Qos, ServiceType, WireType};
 
@@ -23,6 +23,8 @@ pub struct Graph {
     pub sought: BTreeMap<String, Vec<String>>,
     /// Node → all that it has, with what tools hide, such as the parts of actions. Told by ROS 2 only.
     pub ends: BTreeMap<String, NodeEnds>,
+    /// Enclave that processes were put into (`--enclave`) → their nodes, for all but the root. Told by ROS 2 only.
+    pub enclaves: BTreeMap<String, BTreeSet<String>>,
 }
 
 /// What is there, under whatever name. What tools hide, by a name with a part that begins with `_`, stands in [`Graph::ends`] alone.

@@ -192,6 +192,7 @@ impl Inner {
                 .collect(),
             sought: state.sought.clone(),
             ends: BTreeMap::new(),
+            enclaves: BTreeMap::new(),
         }
     }
 

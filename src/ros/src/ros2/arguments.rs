@@ -197,6 +197,13 @@ pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
     Ok(parts)
 }
 
+/// Whether a command line says in which namespace its nodes are; else their program may.
+pub fn gives_namespace(argv: &[String]) -> bool {
+    let parts = parse(argv).unwrap_or_default();
+    let mut kinds = parts.iter().map(|part| &part.kind);
+    kinds.any(|kind| matches!(kind, Kind::Rule(rule) if rule.of == Renamed::Namespace))
+}
+
 fn value_of<'a>(
     flag: &str,
     next: Option<&'a String>,

@@ -41,6 +41,16 @@ pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid
     graph.nodes = shown
         .map(|(name, participant)| (name.to_owned(), participant.to_string()))
         .collect();
+    let enclaves = seen.enclaves.iter();
+    graph.enclaves = enclaves
+        .map(|(enclave, nodes)| {
+            let shown = nodes.iter().filter(|name| !names::is_hidden(name));
+            (
+                enclave.clone(),
+                shown.map(|name| name.to_string()).collect(),
+            )
+        })
+        .collect();
     graph
 }
 
@@ -304,6 +314,42 @@ mod tests {
         let graph = build(&seen, &OwnEnds::default(), ("/us", guid(3, 0, true)));
         let fib = &graph.actions["/fib"];
         assert_eq!(fib.type_name, "test_msgs/action/Fibonacci");
+    }
+
+    #[test]
+    fn nodes_of_one_name_are_told_apart_by_their_enclaves() {
+        let participants = [
+            participant(1, b"enclave=/;"),
+            participant(2, b"enclave=/a/b;"),
+            participant(3, b"x=y;enclave=/c;;"),
+            participant(4, b"enclave=/c;"),
+            participant(5, b"enclave=\xff;"),
+            participant(6, b""),
+        ];
+        let mut discovered = Discovered::default();
+        let mut told = HashMap::new();
+        for told_of in participants {
+            let node = |name: String| Node {
+                name: name.into(),
+                readers: Vec::new(),
+                writers: Vec::new(),
+            };
+            let own = format!("/own_{}", told_of.prefix.0[0]);
+            let entities = Entities {
+                nodes: vec![node("/see".into()), node(own), node("/_hidden".into())],
+                gids: GidSize::Sixteen,
+            };
+            told.insert(told_of.prefix, Arc::new(entities));
+            discovered.participants.insert(told_of.prefix, told_of);
+        }
+        let seen = Seen::new(Arc::new(discovered), &told);
+        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(9, 0, true)));
+        let nodes = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
+        let expected = [
+            ("/a/b".to_owned(), nodes(&["/own_2", "/see"])),
+            ("/c".to_owned(), nodes(&["/own_3", "/own_4", "/see"])),
+        ];
+        assert_eq!(graph.enclaves, expected.into());
     }
 
     #[test]

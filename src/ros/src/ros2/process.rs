@@ -1,10 +1,10 @@
 //! How a process becomes a node of ROS 2: its environment and its command line
 //! (<https://design.ros2.org/articles/ros_command_line_arguments.html>).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::bus::ParamValue;
-use crate::identity::Identity;
+use crate::identity::{Called, Identity};
 
 /// The domain of every servant's nodes, and of the bus that speaks with them. A servant's network is its own, so that all can
 /// have the same.
@@ -32,19 +32,30 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
 }
 
 pub(crate) fn identity(node: &str) -> Identity {
-    let (above, last) = node.rsplit_once('/').unwrap_or(("", node));
+    let (above, last) = halves(node);
     remapped(&[("__node", last), ("__ns", or_root(above))])
 }
 
-/// A rule for each node of a process that is called otherwise than by its program.
-pub(crate) fn renamed(nodes: &[(String, String)]) -> Identity {
-    let rules = nodes.iter().filter_map(|(own, node)| {
-        let last = node.rsplit('/').next().unwrap_or(node);
-        (own != last).then(|| (format!("{own}:__node"), last))
-    });
-    let rules: Vec<_> = rules.collect();
+/// Rules for each node of a process that is called otherwise than by its program. A program that says another name each time is told by rules for all
+/// of its nodes, since no other would fit: then there is one.
+pub(crate) fn renamed(nodes: &[Called]) -> Identity {
+    let mut rules = BTreeSet::new();
+    for Called { own, node } in nodes {
+        let Some(own) = own else {
+            return identity(node);
+        };
+        let ((_, own), (_, last)) = (halves(own), halves(node));
+        if own != last {
+            rules.insert((format!("{own}:__node"), last));
+        }
+    }
     let rules: Vec<_> = rules.iter().map(|(from, to)| (&**from, *to)).collect();
     remapped(&rules)
+}
+
+/// Namespace and name.
+fn halves(node: &str) -> (&str, &str) {
+    node.rsplit_once('/').unwrap_or(("", node))
 }
 
 /// Where a rule stands before all others of a command line: rcl takes the first that fits.
@@ -53,8 +64,13 @@ pub(crate) fn first_rule(argv: &[String]) -> usize {
     first.unwrap_or(argv.len())
 }
 
-pub(crate) fn namespace(namespace: &str) -> Identity {
-    remapped(&[("__ns", or_root(namespace))])
+/// Without security an enclave is a word that others are told. Of several the last one counts.
+pub(crate) fn in_enclave(enclave: &str) -> Identity {
+    let argument = ["--enclave".to_owned(), enclave.to_owned()];
+    Identity {
+        arguments: ros_arguments(std::iter::once(argument)),
+        environment: BTreeMap::new(),
+    }
 }
 
 /// Arguments that give the node of this absolute name its parameters: those below its name, and those without a namespace,
@@ -177,19 +193,24 @@ mod tests {
     #[test]
     fn nodes_of_a_process_are_renamed_one_by_one_and_before_all_other_rules() {
         let told = |nodes: &[(&str, &str)]| {
-            let nodes = nodes
-                .iter()
-                .map(|(own, node)| ((*own).to_owned(), (*node).to_owned()));
+            let nodes = nodes.iter().map(|(own, node)| Called {
+                own: (!own.is_empty()).then(|| (*own).to_owned()),
+                node: (*node).to_owned(),
+            });
             renamed(&nodes.collect::<Vec<_>>()).arguments
         };
-        assert_eq!(told(&[("talker", "/front/talker")]), [""; 0]);
+        assert_eq!(told(&[("/front/talker", "/front/talker")]), [""; 0]);
         let nodes = [
-            ("ears", "/front/ears_2"),
-            ("mouth", "/front/mouth"),
-            ("nose", "/nose_2"),
+            ("/front/ears", "/front/ears_2"),
+            ("/front/mouth", "/front/mouth"),
+            ("/nose", "/nose_2"),
+            ("/rear/ears", "/rear/ears_2"),
         ];
         let rules = ["-r", "ears:__node:=ears_2", "-r", "nose:__node:=nose_2"];
         assert_eq!(told(&nodes), [&["--ros-args"], &rules[..]].concat());
+        // Another name each time.
+        let all = ["--ros-args", "-r", "__node:=see", "-r", "__ns:=/front"];
+        assert_eq!(told(&[("", "/front/see")]), all);
         let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
         assert_eq!(first_rule(&argv("/x -v --ros-args -r __ns:=/front")), 2);
         assert_eq!(first_rule(&argv("/x -v")), 2);
@@ -213,7 +234,10 @@ mod tests {
             );
             assert!(identity.environment.is_empty());
         }
-        assert_eq!(namespace("/x").arguments, ["--ros-args", "-r", "__ns:=/x"]);
+        assert_eq!(
+            in_enclave("/x").arguments,
+            ["--ros-args", "--enclave", "/x"]
+        );
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Who is there beside us, with which ends and which nodes, seen at one moment.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use rtps::{Discovered, EndpointData, EntityId, Guid, GuidPrefix, ParticipantData};
@@ -8,6 +8,11 @@ use rtps::{Discovered, EndpointData, EntityId, Guid, GuidPrefix, ParticipantData
 use super::entities::{Entities, GidSize};
 use super::{names, type_hash};
 use crate::bus::{PeerId, WireFormat, WireType};
+
+/// Before the name of its enclave in a participant's user data, which `;` ends.
+const ENCLAVE: &[u8] = b"enclave=";
+/// The longest name of an enclave that rmw allows.
+const MAX_ENCLAVE: usize = 255;
 
 /// What was discovered, and what participants told of their nodes.
 #[derive(Debug, Clone, Default)]
@@ -17,6 +22,8 @@ pub(super) struct Seen {
     pub(super) nodes: BTreeMap<Arc<str>, Guid>,
     /// Whether some participant writes gids as distributions before Iron do.
     pub(super) gids: GidSize,
+    /// Enclave → the nodes of its participants, for all but the root.
+    pub(super) enclaves: BTreeMap<String, BTreeSet<Arc<str>>>,
     owners: HashMap<Guid, Arc<str>>,
     /// Ends of whose node nothing was told in time.
     pub(super) late: HashSet<Guid>,
@@ -30,10 +37,20 @@ impl Seen {
         told: &HashMap<GuidPrefix, Arc<Entities>>,
     ) -> Self {
         let (mut nodes, mut owners) = (BTreeMap::new(), HashMap::new());
+        let mut enclaves: BTreeMap<String, BTreeSet<Arc<str>>> = BTreeMap::new();
         let mut gids = GidSize::Sixteen;
         for (prefix, entities) in told {
             if entities.gids == GidSize::TwentyFour {
                 gids = GidSize::TwentyFour;
+            }
+            let data = discovered.participants.get(prefix);
+            let enclave = data.and_then(|data| enclave(&data.user_data));
+            if let Some(enclave) = enclave.filter(|name| *name != "/") {
+                let names = entities.nodes.iter().map(|node| Arc::clone(&node.name));
+                enclaves
+                    .entry(enclave.to_owned())
+                    .or_default()
+                    .extend(names);
             }
             for node in &entities.nodes {
                 nodes.insert(Arc::clone(&node.name), participant(*prefix));
@@ -50,6 +67,7 @@ impl Seen {
             discovered,
             nodes,
             gids,
+            enclaves,
             owners,
             late: HashSet::new(),
         }
@@ -92,12 +110,8 @@ impl Seen {
     /// Whether all is known of an end that is to be known: its node, where its participant is one of ROS, which tells of its nodes
     /// a moment after it has told of the end.
     pub(super) fn is_named(&self, end: Guid) -> bool {
-        const ENCLAVE: &[u8] = b"enclave=";
         let participant = self.discovered.participants.get(&end.prefix);
-        let of_ros = |it: &ParticipantData| {
-            let mut windows = it.user_data.windows(ENCLAVE.len());
-            windows.any(|at| at == ENCLAVE)
-        };
+        let of_ros = |it: &ParticipantData| behind_enclave(&it.user_data).is_some();
         self.owners.contains_key(&end)
             || self.late.contains(&end)
             || participant.is_some_and(|it| !of_ros(it))
@@ -112,6 +126,22 @@ impl Seen {
             .map(|end| end.guid)
             .filter(|end| !self.is_named(*end))
     }
+}
+
+/// What stands behind `enclave=` in a participant's user data; none where it is none of ROS.
+fn behind_enclave(user_data: &[u8]) -> Option<&[u8]> {
+    let mut windows = user_data.windows(ENCLAVE.len());
+    let at = windows.position(|at| at == ENCLAVE)?;
+    user_data.get(at + ENCLAVE.len()..)
+}
+
+/// The enclave that a participant is in.
+fn enclave(user_data: &[u8]) -> Option<&str> {
+    let name = behind_enclave(user_data)?
+        .split(|byte| *byte == b';')
+        .next()?;
+    let name = std::str::from_utf8(name).ok();
+    name.filter(|name| name.len() <= MAX_ENCLAVE)
 }
 
 /// The GUID of a participant itself.

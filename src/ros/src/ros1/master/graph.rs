@@ -139,6 +139,7 @@ mod tests {
             actions: BTreeMap::new(),
             sought: [("/map".to_owned(), vec!["/b".to_owned()])].into(),
             ends: BTreeMap::new(),
+            enclaves: BTreeMap::new(),
         };
         let (read, run_id) = from_value(&to_value(&graph, "r")).unwrap();
         assert_eq!((read, run_id.as_str()), (graph, "r"));
