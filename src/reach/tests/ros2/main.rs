@@ -9,6 +9,7 @@ mod links;
 mod network;
 mod network_pictures;
 mod parameters;
+mod pictures;
 mod robot;
 mod rosbridge;
 mod servers;
