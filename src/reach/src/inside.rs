@@ -12,6 +12,7 @@ use ros::schema::Registry;
 use tokio::sync::watch;
 
 use crate::Stream;
+use crate::endings::Endings;
 
 /// WebSocket close code for something that failed here.
 const FAILED: u16 = 1011;
@@ -20,7 +21,14 @@ const ENDS: u16 = 1012;
 
 /// Joins the servant's ROS, once for all who look.
 pub(crate) type Joining =
-    Box<dyn Fn() -> BoxFuture<'static, Result<Arc<dyn Bus>, BusError>> + Send + Sync>;
+    Box<dyn Fn() -> BoxFuture<'static, Result<Joined, BusError>> + Send + Sync>;
+
+/// A node of ours in the servant's ROS.
+pub(crate) struct Joined {
+    pub(crate) bus: Arc<dyn Bus>,
+    /// Tells it of processes that have ended, where the servant has some.
+    pub(crate) endings: Option<Endings>,
+}
 
 /// Where people look into one servant.
 pub(crate) struct Inside {
@@ -44,6 +52,7 @@ struct State {
 struct Looking {
     bus: Arc<dyn Bus>,
     bridge: Arc<Bridge>,
+    _endings: Option<Endings>,
 }
 
 /// The servant's ROS as those see it who look, for as long as this lives.
@@ -131,10 +140,15 @@ impl Inside {
             return Ok(looking);
         }
         let joined = (self.join)().await;
-        let bus = joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
+        let Joined { bus, endings } =
+            joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
         let registry = Arc::clone(&self.registry);
         let bridge = Bridge::new(Arc::clone(&bus), registry, self.options.clone());
-        let looking = Arc::new(Looking { bus, bridge });
+        let looking = Arc::new(Looking {
+            bus,
+            bridge,
+            _endings: endings,
+        });
         let mut state = self.state.lock();
         // It may have been closed meanwhile.
         state.check()?;
@@ -154,6 +168,43 @@ impl State {
         match &*self.closed.borrow() {
             Some(reason) => Err((ENDS, reason.clone())),
             None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::JoinOptions;
+    use ros::bus::RosVersion;
+    use ros::net::HostSockets;
+    use tokio::sync::broadcast;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn processes_that_end_are_told_to_those_who_look_as_long_as_they_do() {
+        let (events, _) = broadcast::channel(4);
+        let told = events.clone();
+        let join = move || -> BoxFuture<'static, _> {
+            let events = told.subscribe();
+            Box::pin(async move {
+                let mut options = JoinOptions::in_domain(0, "/looks");
+                options.network.alone = true;
+                let bus = ros::connect(RosVersion::Two, Arc::new(HostSockets), options).await?;
+                let endings = Some(Endings::follow(events, Arc::clone(&bus)));
+                Ok(Joined { bus, endings })
+            })
+        };
+        let registry = Arc::new(Registry::of(RosVersion::Two));
+        let inside = Inside::new(Box::new(join), registry, &BridgeOptions::default());
+        let first = inside.look().await.expect("looked");
+        let second = inside.look().await.expect("looked");
+        drop(first);
+        tokio::task::yield_now().await;
+        assert_eq!(events.receiver_count(), 1, "one node, which is told");
+        drop(second);
+        while events.receiver_count() > 0 {
+            tokio::task::yield_now().await;
         }
     }
 }

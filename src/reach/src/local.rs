@@ -14,6 +14,7 @@ use crate::components::{Components, Wanted};
 use crate::egress::{self, Relays};
 use crate::endings::Endings;
 use crate::in_process::{Behind, InProcess};
+use crate::inside::Joined;
 use crate::lifecycle::Lifecycles;
 use crate::links::Nodes;
 use crate::nodes::LinkedNodes;
@@ -71,6 +72,7 @@ impl Opener for LocalOpener {
             ..joining.clone()
         };
         let (ros, beside) = (options.ros, Arc::clone(&sockets));
+        let looked_at = Arc::clone(servant);
         let joined = ros::connect(options.ros, sockets, joining);
         let (bus, recorded) = tokio::join!(joined, recorded);
         let bus = bus?;
@@ -87,7 +89,14 @@ impl Opener for LocalOpener {
             linked: (Arc::clone(&bus), nodes),
             bus,
             inside: Box::new(move || {
-                ros::connect(ros, Arc::clone(&beside) as _, looking.clone()).boxed()
+                let events = looked_at.events();
+                let joined = ros::connect(ros, Arc::clone(&beside) as _, looking.clone());
+                let joined = async move {
+                    let bus = joined.await?;
+                    let endings = Some(Endings::follow(events, Arc::clone(&bus)));
+                    Ok(Joined { bus, endings })
+                };
+                joined.boxed()
             }),
             registry,
             lifecycles,

@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 use super::Group;
 use super::nodes::SharedNodes;
 use crate::in_process::{Behind, InProcess};
+use crate::inside::Joined;
 use crate::{Observer, Reach, ReachOptions, Recorded};
 
 /// A place for one robot; `place` is its id.
@@ -30,8 +31,9 @@ pub fn seat(
         bus,
         linked: (linked, Arc::new(nodes)),
         inside: Box::new(move || {
-            let shown = Arc::clone(&shown);
-            async move { Ok(shown) }.boxed()
+            let bus = Arc::clone(&shown);
+            let endings = None;
+            async move { Ok(Joined { bus, endings }) }.boxed()
         }),
         registry,
         // Those of its servants are looked after there.
