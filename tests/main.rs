@@ -389,6 +389,7 @@ fn main() -> ExitCode {
         ],
         stories![ros2:
             a_workspace_is_pushed_and_asked_by_rosbridge,
+            a_prebuilt_space_is_served_with_its_interfaces,
             two_programs_of_several_nodes_have_nodes_of_their_own_names,
             nodes_stay_in_the_namespaces_that_their_programs_give_them,
             a_herald_in_the_cloud_is_a_node_of_the_robot,

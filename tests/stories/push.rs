@@ -321,7 +321,6 @@ pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
 pub fn a_prebuilt_space_is_served() -> Verdict {
     let daemon = world().with(ADDER)?;
     let place = tempfile::tempdir()?;
-    // The install space that the push of the source package made, taken out of its image.
     let space = extract_install_space(&daemon, "adder_py", place.path())?;
     daemon
         .deployer()
@@ -341,7 +340,8 @@ pub fn a_prebuilt_space_is_served() -> Verdict {
     Ok(())
 }
 
-fn extract_install_space(
+/// The install space that a push has made, taken out of its image.
+pub fn extract_install_space(
     daemon: &Daemon,
     service: &str,
     to: &std::path::Path,
@@ -352,20 +352,9 @@ fn extract_install_space(
         .args(["unpack", "--image", &image])
         .arg(&bundle))?
     .succeeded()?;
-    let marker = run(Command::new("find")
-        .arg(bundle.join("rootfs/opt"))
-        .args(["-name", ".catkin"]))?
-    .succeeded()?;
-    let marker = marker
-        .stdout
-        .lines()
-        .next()
-        .context("an install space in the image")?
-        .to_owned();
-    Ok(std::path::Path::new(&marker)
-        .parent()
-        .context("its directory")?
-        .to_owned())
+    let space = bundle.join("rootfs/opt/cloudroid/install");
+    ensure!(space.is_dir(), "an install space in the image");
+    Ok(space)
 }
 
 pub fn an_unchanged_push_builds_no_layer() -> Verdict {

@@ -25,6 +25,8 @@ use support::world::{ADDER, HERALD, SEER, world};
 use support::{Verdict, binaries};
 use tokio::sync::Notify;
 
+use crate::push::extract_install_space;
+
 /// For an answer that may never come.
 const MEANWHILE: Duration = Duration::from_secs(5);
 const THE_HERALD: (&str, &str, &str) = ("herald", "herald", "herald");
@@ -81,6 +83,27 @@ pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
         told["values"]["counted"] == json!([1, 2, 3]) && told["result"] == true,
         "{told}"
     );
+    robot.leaves()
+}
+
+pub fn a_prebuilt_space_is_served_with_its_interfaces() -> Verdict {
+    let daemon = world().with(HERALD)?;
+    let place = tempfile::tempdir()?;
+    let space = extract_install_space(&daemon, "herald", place.path())?;
+    let space = space.to_string_lossy();
+    let words = [
+        "push",
+        &*space,
+        "--name",
+        "prebuilt-herald",
+        "--node",
+        "herald/herald",
+    ];
+    daemon.deployer().types(&words)?.succeeded()?;
+    let mut robot = daemon.robot("prebuilt-herald?robot=herald-of-a-space")?;
+    let greeted = robot.calls("/greet", json!({"name": "robot"}))?;
+    let text = &greeted["values"]["greeting"]["text"];
+    ensure!(text == "Hello, robot", "{greeted}");
     robot.leaves()
 }
 
