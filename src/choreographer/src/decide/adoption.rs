@@ -42,9 +42,43 @@ pub fn fate(found: Found) -> Fate {
     }
 }
 
+/// A node that was started in it.
+#[derive(Debug, Clone, Copy)]
+pub struct Started {
+    /// It has the name of one of the revision's own nodes, as a stub's node has where its robot gives no other.
+    pub planned: bool,
+    /// Whoever started it said for which run, as stubs do.
+    pub run: bool,
+}
+
+/// Whether its robot's stubs start and end its nodes. Those of earlier versions do not say for which run.
+pub fn is_linked(started: &[Started]) -> bool {
+    started.iter().any(|node| node.run) || !started.iter().any(|node| node.planned)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn stubs_are_known_by_the_runs_of_their_nodes() {
+        for (started, linked) in [
+            (&[][..], true),
+            (&[(false, true)], true),
+            (&[(false, false)], true),
+            // One of the package's nodes, under the name that it always has; the package may have others.
+            (&[(true, true)], true),
+            (&[(true, false), (true, true)], true),
+            (&[(true, false), (true, false)], false),
+        ] {
+            let nodes = started.iter().map(|(planned, run)| Started {
+                planned: *planned,
+                run: *run,
+            });
+            let nodes: Vec<Started> = nodes.collect();
+            assert_eq!(is_linked(&nodes), linked, "{started:?}");
+        }
+    }
 
     #[test]
     fn what_was_left_is_kept_for_its_robot_or_ended() {

@@ -8,7 +8,7 @@ use super::warm_pool::NOBODY;
 use servant::engine::ContainerState;
 
 use crate::Error;
-use crate::decide::adoption::{Fate, Found, fate};
+use crate::decide::adoption::{Fate, Found, Started, fate, is_linked};
 use crate::decide::demand::Asked;
 use crate::{Choreographer, Handle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
@@ -141,10 +141,12 @@ impl Choreographer {
             revision,
             record.created,
         ));
-        // One whose own nodes were never started works for stubs.
-        let started = servant.nodes();
-        let own = &handle.revision.plan.nodes;
-        if !own.iter().any(|node| started.contains(&node.name)) {
+        let planned = &handle.revision.plan.nodes;
+        let started = servant.nodes().into_iter().map(|name| Started {
+            planned: planned.iter().any(|node| node.name == name),
+            run: servant.run(&name).is_some(),
+        });
+        if is_linked(&started.collect::<Vec<_>>()) {
             handle.set_linked();
         }
         {
