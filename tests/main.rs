@@ -231,9 +231,9 @@ fn main() -> ExitCode {
             a_calibration_that_nobody_waits_for_leaves_nothing,
             a_calibration_gives_way_to_a_robot,
         ],
-        stories![calls:
+        stories![calls: a_cpp_node_waits_for_the_robot_and_calls_it],
+        of_both![calls:
             a_python_node_calls_the_robot,
-            a_cpp_node_waits_for_the_robot_and_calls_it,
             a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link,
             siblings_come_first_and_other_robots_are_not_asked,
         ],
@@ -343,8 +343,10 @@ fn main() -> ExitCode {
         ],
         stories![terms:
             a_robot_is_given_what_its_sla_costs,
-            a_stub_states_what_its_robot_says_before_it_is_admitted,
             a_robot_that_says_nothing_of_its_pictures_pays_for_those_that_it_sends,
+        ],
+        of_both![terms:
+            a_stub_states_what_its_robot_says_before_it_is_admitted,
             what_a_stub_passes_on_is_measured_as_well,
         ],
         stories![launched:
@@ -361,6 +363,7 @@ fn main() -> ExitCode {
         of_both![goals:
             an_action_is_carried_out_in_the_cloud,
             an_action_is_carried_out_by_the_original_while_the_cloud_is_slow,
+            a_goal_is_carried_out_once_however_often_the_link_is_cut,
         ],
         stories![crossing:
             settings_are_changed_through_dynamic_reconfigure,
@@ -375,17 +378,19 @@ fn main() -> ExitCode {
         ],
         of_both![farewells: a_stub_ends_beside_a_daemon_that_is_frozen_or_killed],
         stories![patience: a_node_that_waits_is_seen_whole_and_driven_by_its_robot],
-        stories![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
+        of_both![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,
-            two_nodes_share_a_servant,
-            what_a_stub_cannot_do_is_said,
             the_robot_s_graph_is_the_original_s,
             a_lost_link_is_taken_up_again,
+            the_robot_s_master_starts_again,
+        ],
+        of_both![link:
+            two_nodes_share_a_servant,
+            what_a_stub_cannot_do_is_said,
             a_connection_that_falls_silent_is_replaced,
             one_message_right_after_connecting_is_not_lost,
             who_has_just_connected_hears_what_the_node_answers,
-            the_robot_s_master_starts_again,
         ],
         stories![ros2:
             a_workspace_is_pushed_and_asked_by_rosbridge,
@@ -410,13 +415,16 @@ fn main() -> ExitCode {
         ],
         stories![hung: a_node_that_answers_no_more_is_told_and_started_again],
         stories![mishaps:
-            a_later_revision_is_gone_on_with_unless_its_interface_differs,
             another_version_of_the_protocol_is_named,
+            parameters_that_cannot_be_carried_are_named_and_the_others_arrive,
+            a_local_original_that_crashes_is_told_and_started_again,
+        ],
+        of_both![mishaps:
+            a_later_revision_is_gone_on_with_unless_its_interface_differs,
             a_wrong_token_is_named,
             two_robots_with_one_id_are_told,
-            parameters_that_cannot_be_carried_are_named_and_the_others_arrive,
             a_missing_original_is_said_once_and_the_cloud_goes_on,
-            a_local_original_that_crashes_is_told_and_started_again,
+            an_original_that_crashes_is_told_and_started_again,
             a_service_that_is_gone_leaves_the_local_original,
         ],
         stories![breakin:

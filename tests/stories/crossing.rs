@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use ros::bus::{
-    Bus, GlobalParameters, Message, ParamValue, Publisher, Qos, RosVersion, Subscription, WireType,
+    GlobalParameters, Message, ParamValue, Publisher, Qos, RosVersion, Subscription, WireType,
 };
 use ros::ros1::Ros1Bus;
 use ros::schema::{MessageType, Registry};
@@ -15,7 +15,8 @@ use support::cable::{Badness, Cable};
 use support::layout::Layout;
 use support::robot::PATIENCE;
 use support::ros_system::Node;
-use support::site::{Running, Site};
+use support::site::{Running, Site, text_of};
+use support::twins::triggered;
 use support::world::{CROSSING, CROSSING_TWO, PEOPLE, Service, world};
 
 const NODE: &str = "/crossing";
@@ -146,29 +147,6 @@ fn point(ros: RosVersion, at: i64) -> Bytes {
 /// Whether they are the same, but for the first four bytes: what rospy fills in, or how CDR is written.
 fn is_same(one: &[u8], other: &[u8]) -> bool {
     one.get(4..) == other.get(4..)
-}
-
-/// The text that a message ends with, behind so many bytes of flags.
-fn text_of(ros: RosVersion, message: &[u8], flags: usize) -> anyhow::Result<String> {
-    let at = match ros {
-        RosVersion::One => flags + 4,
-        RosVersion::Two => 4 + flags.next_multiple_of(4) + 4,
-    };
-    let text = message.get(at..).context("too short")?;
-    let text = String::from_utf8_lossy(text);
-    Ok(text.trim_end_matches('\0').to_owned())
-}
-
-/// What std_srvs/Trigger answered.
-fn triggers(site: &Site, app: &Arc<dyn Bus>, service: &str) -> anyhow::Result<String> {
-    let ros = site.system.version();
-    let mut request = Layout::of(ros);
-    if ros == RosVersion::Two {
-        // An empty message is a byte.
-        request.u8(0);
-    }
-    let answer = site.calls(app, service, &request.finish())?;
-    text_of(ros, &answer, 1)
 }
 
 /// The service of the crossing node in this ROS, and its executable in the package of the same name.
@@ -355,7 +333,7 @@ pub fn simulated_time_is_the_robot_s(ros: RosVersion) -> Verdict {
     site.connected(&*points, 1)?;
     let mut seen = site.hears(&app, "/crossing/seen")?;
     // The clock stands until the next tick, so it is asked for, not waited for.
-    let told = || triggers(&site, &app, "/crossing/now");
+    let told = || Ok(triggered(&site, &app, "/crossing/now")?.1);
     let deadline = Instant::now() + PATIENCE;
     loop {
         let now = with_log(told(), &stub)?;

@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicUsize, Ordering};
 
 use anyhow::{Context, ensure};
-use bytes::Bytes;
-use ros::bus::{Bus, Graph};
+use ros::bus::{BusError, Graph, RosVersion, WireFormat};
 use support::Verdict;
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::robot::PATIENCE;
-use support::site::{Running, Site, string};
-use support::world::{ADDER, GREETER, world};
+use support::site::{Site, string_of, text_of};
+use support::twins::{Twin, sum, sum_of};
+use support::world::world;
 
 /// Callers at the same time.
 const CALLERS: usize = 4;
@@ -46,36 +46,33 @@ fn holds(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
     Ok((count("fd")?, count("task")?, resident.context("VmRSS")?))
 }
 
-pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> Verdict {
+pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
+    ros: RosVersion,
+) -> Verdict {
     // A thousand: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
     let cuts = std::env::var("CLOUDROID_CUTS")
         .ok()
         .and_then(|cuts| cuts.parse().ok())
         .unwrap_or(60);
+    let (adder, greeter) = (Twin::adder(ros), Twin::greeter(ros));
     // Of its own: what it holds is looked at.
-    let daemon = world().own("cuts").start()?;
-    for service in [ADDER, GREETER] {
-        daemon
-            .deployer()
-            .pushes(service.name, service.arguments)?
-            .succeeded()?;
+    let daemon = world().own(&adder.robot("cuts")).start()?;
+    let mut services = vec![adder.service, greeter.service];
+    services.dedup_by_key(|service| service.name);
+    for service in services {
+        let package = service.package.context("a package")?;
+        let pushed = daemon.deployer().pushes(package, service.arguments)?;
+        pushed.succeeded()?;
     }
     let cutter = Cutter::new(&daemon.address, cuts, STRETCH, 0x5eed)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let stub = |service: &str, node: &str, argv: &[&str]| -> anyhow::Result<Running> {
-        let toml = format!(
-            "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"cut-{service}\"\nlocal = \"none\"\n",
-            cutter.server
-        );
-        site.stub_with(&toml, service, node, argv)
-    };
-    let adder = stub("adder_py", "adder.py", &["__name:=adder"])?;
-    let greeter = stub(
-        "greeter_cpp",
-        "greeter",
-        &["__name:=greeter", "~name:=/who"],
-    )?;
+    let server = cutter.server.to_string();
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let (adds, greets) = (adder.robot("cut-adder"), greeter.robot("cut-greeter"));
+    let argv = adder.argv("adder", &[]);
+    let adder = adder.stub(&site, (&server, &adds), "", &argv)?;
+    let argv = greeter.argv("greeter", &[("~name", "/who")]);
+    let greeter = greeter.stub(&site, (&server, &greets), "", &argv)?;
     let said = || {
         format!(
             "the adder's:\n{}\nthe greeter's:\n{}",
@@ -90,19 +87,12 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
     let names = site.says(&app, "/who", false)?;
     site.connected(&*names, 1)?;
     let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    site.fed(&greetings, 1)?;
     let mut sums = site.hears(&app, "/sums")?;
     // Both outputs are heard from here on.
     let next = Arc::new(AtomicI64::new(1));
-    let add = |number: i64| {
-        let request = [number.to_le_bytes(), 0_i64.to_le_bytes()].concat();
-        (
-            Bytes::from(request),
-            Bytes::copy_from_slice(&number.to_le_bytes()),
-        )
-    };
     loop {
-        let (request, _) = add(0);
-        site.calls(&app, "/add_two", &request)?;
+        site.calls(&app, "/add_two", &sum(ros, 0))?;
         let heard = site.runtime.block_on(async {
             let patience = std::time::Duration::from_millis(200);
             tokio::time::timeout(patience, sums.messages.recv()).await
@@ -111,7 +101,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
             break;
         }
     }
-    names.publish(string("0"));
+    names.publish(string_of(WireFormat::of(ros), "0"));
     site.next(&mut greetings).with_context(said)?;
     let before = [
         holds(adder.pid())?,
@@ -127,14 +117,15 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
         .block_on(async {
             let call = async || {
                 while !over() {
-                    let (request, sum) = add(next.fetch_add(1, Ordering::Relaxed));
-                    match app.call("/add_two", request, PATIENCE).await {
+                    let number = next.fetch_add(1, Ordering::Relaxed);
+                    match app.call("/add_two", sum(ros, number), PATIENCE).await {
                         Ok(response) => {
-                            ensure!(response == sum, "{response:?} is not {sum:?}");
+                            let response = sum_of(ros, &response)?;
+                            ensure!(response == number, "{response} is not {number}");
                             answered.fetch_add(1, Ordering::Relaxed);
                         }
                         // A reason is an answer; silence is none.
-                        Err(ros::bus::BusError::CallFailed { .. }) => {
+                        Err(BusError::CallFailed { .. }) => {
                             failed.fetch_add(1, Ordering::Relaxed);
                         }
                         Err(error) => anyhow::bail!("a call was lost: {error}"),
@@ -152,7 +143,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
                 let mut count = 0_u32;
                 while !over() {
                     count += 1;
-                    names.publish(string(&count.to_string()));
+                    names.publish(string_of(WireFormat::of(ros), &count.to_string()));
                     let greeting = tokio::time::timeout(PATIENCE, greetings.messages.recv()).await;
                     let greeting = greeting
                         .ok()
@@ -175,16 +166,15 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
                 let mut fence = None;
                 loop {
                     if over() && done.load(Ordering::Relaxed) == CALLERS {
-                        let (request, _) = add(next.fetch_add(1, Ordering::Relaxed));
-                        fence.get_or_insert_with(|| next.load(Ordering::Relaxed) - 1);
-                        app.call("/add_two", request, PATIENCE).await?;
+                        let number = next.fetch_add(1, Ordering::Relaxed);
+                        fence.get_or_insert(number);
+                        app.call("/add_two", sum(ros, number), PATIENCE).await?;
                     }
                     let pause = std::time::Duration::from_millis(200);
-                    while let Ok(Some(sum)) =
+                    while let Ok(Some(told)) =
                         tokio::time::timeout(pause, sums.messages.recv()).await
                     {
-                        let sum = String::from_utf8_lossy(&sum.bytes[4..]).into_owned();
-                        let number: i64 = sum.parse()?;
+                        let number: i64 = text_of(ros, &told.bytes, 0)?.parse()?;
                         if fence.is_some_and(|fence| number >= fence) {
                             return anyhow::Ok(executed);
                         }
@@ -223,7 +213,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut() -> V
     // Each answered call has told its sum on a topic, too: it was heard once, or is told as dropped.
     let all_known = support::until("each answered call's sum, heard or told as dropped", || {
         let here = sums.dropped.get();
-        let dropped = here + told_as_dropped(&daemon, "cut-adder_py", "/sums")?;
+        let dropped = here + told_as_dropped(&daemon, &adds, "/sums")?;
         let known = executed as u64 + dropped;
         let told = format!(
             "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as dropped"

@@ -9,6 +9,7 @@ use parking_lot::Mutex;
 use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, Outcome, RosVersion};
 use support::Verdict;
 use support::cable::{Badness, Cable};
+use support::cutter::Cutter;
 use support::layout::Layout;
 use support::robot::PATIENCE;
 use support::site::{Running, Site};
@@ -140,6 +141,40 @@ pub fn an_action_is_carried_out_in_the_cloud(ros: RosVersion) -> Verdict {
     sender.client.cancel("long");
     let (outcome, steps) = sender.ends(&long)?;
     ensure!(outcome == Outcome::Canceled && steps < 0, "{steps}");
+    Ok(())
+}
+
+/// How often the link is cut, and the longest stretch between two cuts, bytes: one or two goals.
+const CUTS: usize = 20;
+const STRETCH: usize = 6_000;
+
+pub fn a_goal_is_carried_out_once_however_often_the_link_is_cut(ros: RosVersion) -> Verdict {
+    const STEPS: u32 = 5;
+    let daemon = world().with(service(ros).0)?;
+    let cutter = Cutter::new(&daemon.address, CUTS, STRETCH, 0x90a1)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = robot_of(ros, "cut-goals");
+    let stub = crossing(&site, &cutter.server.to_string(), &robot, 0, "")?;
+    with_log(is_there(&site, &app), &stub)?;
+    let sender = Sender::new(&site, &app, &stub)?;
+    cutter.begin();
+    let mut goals = Vec::new();
+    while cutter.cuts() < CUTS {
+        let goal = sender.sends(&format!("goal-{}", goals.len()), STEPS);
+        let end = sender.ends(&goal)?;
+        let steps = i32::try_from(STEPS)?;
+        ensure!(end == (Outcome::Succeeded, steps), "{end:?}");
+        goals.push(goal);
+    }
+    // What was said of earlier goals has come before this.
+    sender.ends(&sender.sends("last", 0))?;
+    let all: Vec<i32> = (0..i32::try_from(STEPS)?).collect();
+    for (number, goal) in goals.iter().enumerate() {
+        let steps = sender.steps(goal, all.len())?;
+        ensure!(steps == all, "{steps:?} of goal {number}\n{}", stub.said());
+    }
+    println!("{CUTS} cuts: {} goals", goals.len());
     Ok(())
 }
 

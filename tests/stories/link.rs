@@ -4,16 +4,15 @@ use std::collections::BTreeSet;
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
-use ros::bus::{Bus, GlobalParameters, Graph, ParamValue};
+use ros::bus::{Bus, GlobalParameters, Graph, ParamValue, RosVersion, WireFormat};
 use ros::ros1::Ros1Bus;
 use support::Verdict;
 use support::freezer::Freezer;
-use support::robot::PATIENCE;
-use support::site::{Running, Site, registered, string};
-use support::world::{ADDER, GREETER, PEOPLE, world};
+use support::site::{Running, Site, registered, string, string_of, text_of};
+use support::twins::{Twin, count, sum};
+use support::world::{GREETER, PEOPLE, world};
 
 const THE_GREETER: (&str, &str, &str) = ("greeter_cpp", "greeter_cpp", "greeter");
-const THE_ADDER: (&str, &str, &str) = ("adder_py", "adder_py", "adder.py");
 const PEOPLE_DETECT: (&str, &str, &str) = ("opencv_apps", "opencv_apps", "people_detect");
 
 fn serves(service: &str) -> impl Fn(&Graph) -> bool {
@@ -187,13 +186,17 @@ pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
     Ok(())
 }
 
-pub fn two_nodes_share_a_servant() -> Verdict {
-    let daemon = world().with(GREETER)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let robot = "linked-pair";
-    let one = site.stub(&daemon, THE_GREETER, robot, &["__name:=one", "~name:=/who"])?;
-    let two = site.stub(&daemon, THE_GREETER, robot, &["__name:=two", "~name:=/who"])?;
+pub fn two_nodes_share_a_servant(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = &*twin.robot("linked-pair");
+    let start = |node: &str| {
+        let argv = twin.argv(node, &[("~name", "/who")]);
+        twin.stub(&site, (&daemon.address, robot), "", &argv)
+    };
+    let (one, two) = (start("one")?, start("two")?);
     with_log(site.until(&app, "the first", serves("/one/count")), &one)?;
     with_log(site.until(&app, "the second", serves("/two/count")), &two)?;
     let servants = daemon.deployer().asks(&["servants"])?;
@@ -207,13 +210,15 @@ pub fn two_nodes_share_a_servant() -> Verdict {
     site.connected(&*names, 2)?;
     let mut first = site.hears(&app, "/one/greeting")?;
     let mut second = site.hears(&app, "/two/greeting")?;
-    names.publish(string("robot"));
+    site.fed(&first, 1)?;
+    site.fed(&second, 1)?;
+    names.publish(string_of(WireFormat::of(ros), "robot"));
     // Each hears it once, though both listen.
-    site.next(&mut first)?;
-    site.next(&mut second)?;
-    for service in ["/one/count", "/two/count"] {
-        let count = site.calls(&app, service, &[0])?;
-        ensure!(count[0] == 1, "{service}: {count:?}");
+    with_log(site.next(&mut first), &one)?;
+    with_log(site.next(&mut second), &two)?;
+    for node in ["/one", "/two"] {
+        let count = count(&site, &app, node)?;
+        ensure!(count == 1, "{node}: {count}");
     }
     Ok(())
 }
@@ -272,38 +277,43 @@ pub fn a_lost_link_is_taken_up_again() -> Verdict {
     Ok(())
 }
 
-pub fn what_a_stub_cannot_do_is_said() -> Verdict {
-    let daemon = world().with(GREETER)?;
-    world().with(ADDER)?;
-    let site = Site::new()?;
+pub fn what_a_stub_cannot_do_is_said(ros: RosVersion) -> Verdict {
+    let (greeter, adder) = (Twin::greeter(ros), Twin::adder(ros));
+    let daemon = world().with(greeter.service)?;
+    world().with(adder.service)?;
+    let site = Site::of(ros)?;
+    let (service, package, executable) = greeter.names();
     let server = format!(
-        "server = \"ws://{}\"\nrobot = \"linked-wrong\"\nlocal = \"none\"\n",
-        daemon.address
+        "server = \"ws://{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
+        daemon.address,
+        greeter.robot("linked-wrong")
     );
     let cases = [
         (
             format!("{server}service = \"nothing\""),
-            "greeter",
+            executable,
             "nothing",
         ),
         (
-            format!("{server}service = \"greeter_cpp\""),
+            format!("{server}service = \"{service}\""),
             "no_such",
             "not pushed with the executable no_such",
         ),
         (
-            format!("{server}service = \"greeter_cpp\"\ntoken_file = \"/nowhere/token\""),
-            "greeter",
+            format!("{server}service = \"{service}\"\ntoken_file = \"/nowhere/token\""),
+            executable,
             "/nowhere/token",
         ),
         (
-            format!("{server}service = \"greeter_cpp\"\nmaximum = 3"),
-            "greeter",
+            format!("{server}service = \"{service}\"\nmaximum = 3"),
+            executable,
             "maximum",
         ),
     ];
+    let argv = greeter.argv("wrong", &[]);
+    let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
     for (toml, executable, said) in cases {
-        let mut stub = site.stub_with(&toml, "greeter_cpp", executable, &["__name:=wrong"])?;
+        let mut stub = site.stub_with(&toml, package, executable, &argv)?;
         let status = stub.ends()?;
         ensure!(
             status.code() == Some(1) && stub.said().contains(said),
@@ -312,18 +322,13 @@ pub fn what_a_stub_cannot_do_is_said() -> Verdict {
         );
     }
     // A node that ends takes its stub along, with its status.
-    let mut stub = site.stub(&daemon, THE_ADDER, "linked-ended", &["__name:=adder"])?;
-    let app = site.node("/app")?;
+    let robot = &*adder.robot("linked-ended");
+    let argv = adder.argv("adder", &[]);
+    let mut stub = adder.stub(&site, (&daemon.address, robot), "", &argv)?;
+    let app = site.joins("/app")?;
     with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
-    let servants = daemon.deployer().asks(&["servants"])?;
-    let pid = servants
-        .as_array()
-        .and_then(|all| {
-            all.iter()
-                .find(|servant| servant["robot"] == "linked-ended")
-        })
-        .and_then(|servant| servant["pids"][0].as_i64())
-        .context("its process")?;
+    let servant = daemon.servant_of(adder.service.name, robot)?;
+    let pid = servant["pids"][0].as_i64().context("its process")?;
     nix::sys::signal::kill(
         nix::unistd::Pid::from_raw(i32::try_from(pid)?),
         Signal::SIGKILL,
@@ -334,6 +339,8 @@ pub fn what_a_stub_cannot_do_is_said() -> Verdict {
         "{status}: {}",
         stub.said()
     );
+    // With it goes all that it had.
+    site.until(&app, "its end", |graph| !serves("/add_two")(graph))?;
     Ok(())
 }
 
@@ -367,34 +374,36 @@ pub fn the_robot_s_master_starts_again() -> Verdict {
     Ok(())
 }
 
-pub fn a_connection_that_falls_silent_is_replaced() -> Verdict {
-    let daemon = world().with(GREETER)?;
+pub fn a_connection_that_falls_silent_is_replaced(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let daemon = world().with(twin.service)?;
     let freezer = Freezer::new(&daemon.address)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let server = freezer.server.to_string();
+    let robot = twin.robot("linked-silent");
+    let argv = twin.argv("greeter", &[("~name", "/who")]);
     // It would be given up ten times T_max after it fell silent.
-    let toml = format!(
-        "server = \"ws://{}\"\nservice = \"greeter_cpp\"\nrobot = \"linked-silent\"\nlocal = \"none\"\ndesire = 1.0\nmax = 2.0\n",
-        freezer.server
-    );
-    let argv = ["__name:=greeter", "~name:=/who"];
-    let stub = site.stub_with(&toml, "greeter_cpp", "greeter", &argv)?;
+    let settings = "desire = 1.0\nmax = 2.0\n";
+    let stub = twin.stub(&site, (&server, &robot), settings, &argv)?;
     with_log(
         site.until(&app, "the service", serves("/greeter/count")),
         &stub,
     )?;
     let names = site.says(&app, "/who", false)?;
+    let say = |name: &str| names.publish(string_of(WireFormat::of(ros), name));
     site.connected(&*names, 1)?;
     let mut greetings = site.hears(&app, "/greeter/greeting")?;
-    names.publish(string("first"));
+    site.fed(&greetings, 1)?;
+    say("first");
     with_log(site.next(&mut greetings), &stub)?;
     ensure!(freezer.freeze() == 1, "one connection carries it");
     // What is sent meanwhile is not lost: the same node hears it.
-    names.publish(string("second"));
+    say("second");
     // roscpp may give whoever has just connected the latched one twice.
     while !text(&with_log(site.next(&mut greetings), &stub)?.bytes).contains("second") {}
-    let count = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?;
-    ensure!(count[0] == 2, "{count:?}");
+    let count = with_log(count(&site, &app, "/greeter"), &stub)?;
+    ensure!(count == 2, "{count}");
     let said = stub.said();
     ensure!(
         said.contains("is silent, another takes its place"),
@@ -404,17 +413,18 @@ pub fn a_connection_that_falls_silent_is_replaced() -> Verdict {
     Ok(())
 }
 
-pub fn one_message_right_after_connecting_is_not_lost() -> Verdict {
-    let daemon = world().with(GREETER)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
+pub fn one_message_right_after_connecting_is_not_lost(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
     for round in 0..5 {
         // Each time another servant, whose node has heard nothing yet.
-        let robot = format!("linked-once-{round}");
-        let argv = ["__name:=greeter", "~name:=/who"];
+        let robot = twin.robot(&format!("linked-once-{round}"));
+        let argv = twin.argv("greeter", &[("~name", "/who")]);
         // The application is there first, as often; or it comes to a stub that is.
         let early = site.says(&app, "/who", false)?;
-        let stub = site.stub(&daemon, THE_GREETER, &robot, &argv)?;
+        let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
         let names = if round % 2 == 0 {
             early
         } else {
@@ -423,10 +433,10 @@ pub fn one_message_right_after_connecting_is_not_lost() -> Verdict {
             site.says(&app, "/who", false)?
         };
         with_log(site.connected(&*names, 1), &stub)?;
-        names.publish(string("only"));
+        names.publish(string_of(WireFormat::of(ros), "only"));
         site.until(&app, "the service", serves("/greeter/count"))?;
         support::until("a greeting of what was said at once", || {
-            let greeted = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?[0];
+            let greeted = with_log(count(&site, &app, "/greeter"), &stub)?;
             let lost = || format!("{greeted} in round {round}:\n{}", stub.said());
             Ok((greeted == 1).then_some(()).ok_or_else(lost))
         })?;
@@ -437,25 +447,27 @@ pub fn one_message_right_after_connecting_is_not_lost() -> Verdict {
     Ok(())
 }
 
-pub fn who_has_just_connected_hears_what_the_node_answers() -> Verdict {
-    let daemon = world().with(ADDER)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let stub = site.stub(&daemon, THE_ADDER, "linked-newcomer", &["__name:=adder"])?;
+pub fn who_has_just_connected_hears_what_the_node_answers(ros: RosVersion) -> Verdict {
+    let twin = Twin::adder(ros);
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = twin.robot("linked-newcomer");
+    let argv = twin.argv("adder", &[]);
+    let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
     with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
     for number in 1..=10_i64 {
         // Nobody listens yet: in the cloud the node is subscribed to from now on.
-        let app = site.node(&format!("/app{number}"))?;
+        let app = site.joins(&format!("/app{number}"))?;
         let mut sums = site.hears(&app, "/sums")?;
-        let connected = sums.matched.wait_for(|now| now.connected() == 1);
-        site.runtime
-            .block_on(async { tokio::time::timeout(PATIENCE, connected).await.map(drop) })
-            .context("the stub should be connected to")?;
-        let request = [number.to_le_bytes(), 0_i64.to_le_bytes()].concat();
-        with_log(site.calls(&app, "/add_two", &request), &stub)?;
-        let sum = with_log(site.next(&mut sums), &stub)
+        site.fed(&sums, 1)?;
+        with_log(site.calls(&app, "/add_two", &sum(ros, number)), &stub)?;
+        let told = with_log(site.next(&mut sums), &stub)
             .with_context(|| format!("sum {number} was not heard"))?;
-        ensure!(text(&sum.bytes[4..]) == number.to_string(), "{sum:?}");
+        ensure!(
+            text_of(ros, &told.bytes, 0)? == number.to_string(),
+            "{told:?}"
+        );
         drop(sums);
         site.runtime.block_on(app.close());
     }

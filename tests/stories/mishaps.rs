@@ -1,13 +1,21 @@
 //! What goes wrong on a robot: each thing is named, with its reason and what to do.
 
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
+use std::sync::Arc;
+use std::time::Duration;
+
 use anyhow::{Context, ensure};
-use support::Verdict;
-use support::binaries;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use ros::bus::{Bus, RosVersion, WireFormat};
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::machine::{Machine, free_port};
-use support::site::{Running, Site, string};
-use support::world::{GREETER, TELLER, world};
+use support::site::{Running, Site, string_of};
+use support::twins::Twin;
+use support::world::{TELLER, world};
+use support::{Verdict, binaries, procfs};
 
 /// The stub ends with status 1 and has said all of `words`.
 fn refused(mut stub: Running, words: &[&str]) -> Verdict {
@@ -20,29 +28,86 @@ fn refused(mut stub: Running, words: &[&str]) -> Verdict {
     Ok(())
 }
 
-/// Pushes a variant of the teller as service `teller_rev`.
-fn pushes(daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
-    let place = world().directory("teller")?;
-    let original = binaries::package("teller_py");
-    for name in ["package.xml", "CMakeLists.txt"] {
-        std::fs::copy(original.join(name), place.path().join(name))?;
+/// A package whose node latches what it says at its beginning, and how variants of it differ.
+struct Variants {
+    package: &'static str,
+    /// The service that they are pushed as.
+    service: &'static str,
+    executable: &'static str,
+    /// The node's text, and where it says it.
+    file: &'static str,
+    topic: &'static str,
+    /// One parameter more.
+    another_parameter: &'static [(&'static str, &'static str)],
+    /// The topic has another type.
+    another_type: &'static [(&'static str, &'static str)],
+    /// The two types.
+    types: [&'static str; 2],
+}
+
+impl Variants {
+    fn of(ros: RosVersion) -> Self {
+        match ros {
+            RosVersion::One => Self {
+                package: "teller_py",
+                service: "teller_rev",
+                executable: "teller.py",
+                file: "scripts/teller.py",
+                topic: "/teller/told",
+                another_parameter: &[("\ntold = ", "\nrospy.get_param(\"~more\", 1)\ntold = ")],
+                another_type: &[
+                    ("told\", String", "told\", Int32"),
+                    ("    \"life", "    len(\"life"),
+                    ("    )\n)", "    ))\n)"),
+                ],
+                types: ["std_msgs/String", "std_msgs/Int32"],
+            },
+            RosVersion::Two => Self {
+                package: "courier_ros2",
+                service: "courier_rev",
+                executable: "courier",
+                file: "courier_ros2/node.py",
+                topic: "/home",
+                another_parameter: &[(
+                    "        self.route = None",
+                    "        self.declare_parameter(\"more\", 1)\n        self.route = None",
+                )],
+                another_type: &[
+                    ("import String", "import Int32, String"),
+                    ("(String, \"home\"", "(Int32, \"home\""),
+                    ("String(data=\"in the clouds\")", "Int32(data=1)"),
+                ],
+                types: ["std_msgs/msg/String", "std_msgs/msg/Int32"],
+            },
+        }
     }
-    let mut text = std::fs::read_to_string(original.join("scripts/teller.py"))?;
-    for (old, new) in changes {
-        ensure!(text.contains(old), "{old:?} is not in teller.py");
-        text = text.replace(old, new);
+
+    /// Pushes the package with these changes of its node.
+    fn pushes(&self, daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
+        let place = world().directory(self.package)?;
+        let original = binaries::package(self.package);
+        let copied = std::process::Command::new("cp")
+            .arg("-rT")
+            .args([&*original, place.path()])
+            .status()?;
+        ensure!(copied.success(), "{copied}");
+        let file = place.path().join(self.file);
+        let mut text = std::fs::read_to_string(&file)?;
+        for (old, new) in changes {
+            ensure!(text.contains(old), "{old:?} is not in {}", self.file);
+            text = text.replace(old, new);
+        }
+        std::fs::write(file, text)?;
+        let words = [
+            "push",
+            path_str(place.path()),
+            "--name",
+            self.service,
+            "--node",
+            self.executable,
+        ];
+        daemon.deployer().types(&words)?.succeeded().map(drop)
     }
-    std::fs::create_dir(place.path().join("scripts"))?;
-    std::fs::write(place.path().join("scripts/teller.py"), text)?;
-    let words = [
-        "push",
-        path_str(place.path()),
-        "--name",
-        "teller_rev",
-        "--node",
-        "teller.py",
-    ];
-    daemon.deployer().types(&words)?.succeeded().map(drop)
 }
 
 fn revision_of(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
@@ -53,66 +118,59 @@ fn revision_of(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
     revision.with_context(|| format!("{servants:#}"))
 }
 
-pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs() -> Verdict {
+pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs(ros: RosVersion) -> Verdict {
     let daemon = world().shared()?;
-    pushes(&daemon, &[])?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let robot = "mishap-revisions";
+    let variants = Variants::of(ros);
+    let service = variants.service;
+    variants.pushes(&daemon, &[])?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = &*format!("mishap-revisions-{}", ros.number());
     let settings = format!("robot = \"{robot}\"\nlocal = \"none\"\n");
-    let overlay = site.installs(&daemon, "teller_rev", &settings)?;
-    let start = || site.runs(&overlay, "teller_py", "teller.py", &[]);
+    let overlay = site.installs(&daemon, service, &settings)?;
+    let start = || site.runs(&overlay, variants.package, variants.executable, &[]);
     let speaks = |stub: &Running| -> Verdict {
-        let mut told = site.hears(&app, "/teller/told")?;
-        let told = site.next(&mut told).context(stub.said())?;
-        ensure!(told.wire_type.name == "std_msgs/String");
+        let mut told = site.hears_latched(&app, variants.topic)?;
+        let told = site.next(&mut told).with_context(|| stub.said())?;
+        ensure!(told.wire_type.name == variants.types[0], "{told:?}");
         Ok(())
+    };
+    let stops = || -> Verdict {
+        let words = ["stop", "--service", service];
+        daemon.deployer().types(&words)?.succeeded().map(drop)
     };
     let first = start()?;
     speaks(&first)?;
     // Another parameter breaks nothing: whoever runs goes on, and whoever starts does so with the new revision.
-    pushes(
-        &daemon,
-        &[("\ntold = ", "\nrospy.get_param(\"~more\", 1)\ntold = ")],
-    )?;
+    variants.pushes(&daemon, variants.another_parameter)?;
     speaks(&first)?;
     ensure!(revision_of(&daemon, robot)? == 1);
     drop(first);
-    daemon
-        .deployer()
-        .types(&["stop", "--service", "teller_rev"])?
-        .succeeded()?;
+    stops()?;
     let second = start()?;
     speaks(&second)?;
     ensure!(revision_of(&daemon, robot)? == 2);
     // Another type does.
-    pushes(
-        &daemon,
-        &[
-            ("told\", String", "told\", Int32"),
-            ("    \"life", "    len(\"life"),
-            ("    )\n)", "    ))\n)"),
-        ],
-    )?;
+    variants.pushes(&daemon, variants.another_type)?;
     speaks(&second)?;
     drop(second);
-    daemon
-        .deployer()
-        .types(&["stop", "--service", "teller_rev"])?
-        .succeeded()?;
+    stops()?;
+    let [before, after] = variants.types;
+    let differs = format!(
+        "output topic {} was a {before} and is a {after}",
+        variants.topic
+    );
     refused(
         start()?,
         &[
-            "teller_rev is at revision 3, this robot's stub was made of revision 1",
-            "output topic /teller/told was a std_msgs/String and is a std_msgs/Int32",
-            "install the stub again from /stubs/teller_rev.tar.gz",
+            &format!("{service} is at revision 3, this robot's stub was made of revision 1"),
+            &differs,
+            &format!("install the stub again from /stubs/{service}.tar.gz"),
         ],
     )?;
     // Going back is the other way.
-    daemon
-        .deployer()
-        .types(&["rollback", "teller_rev", "2"])?
-        .succeeded()?;
+    let back = ["rollback", service, "2"];
+    daemon.deployer().types(&back)?.succeeded()?;
     speaks(&start()?)
 }
 
@@ -140,14 +198,14 @@ pub fn another_version_of_the_protocol_is_named() -> Verdict {
     Ok(())
 }
 
-pub fn a_wrong_token_is_named() -> Verdict {
+pub fn a_wrong_token_is_named(ros: RosVersion) -> Verdict {
     let daemon = world()
-        .own("mishap-token")
+        .own(&format!("mishap-token-{}", ros.number()))
         .config("tokens = [\"open sesame\"]\n[tls]\nserve = \"plain-text-beyond-loopback\"\n")
         .listen("0.0.0.0:0")
         .start()?;
     let port = daemon.address.rsplit(':').next().context("a port")?;
-    let site = Site::new()?;
+    let site = Site::of(ros)?;
     let stub = |token: &str| {
         let toml = format!(
             "server = \"ws://127.0.0.1:{port}\"\nservice = \"any\"\nrobot = \"mishap\"\nlocal = \"none\"\n{token}"
@@ -163,44 +221,61 @@ pub fn a_wrong_token_is_named() -> Verdict {
     refused(stub("token = \"open sesame\"\n")?, &["404", "any"])
 }
 
-pub fn two_robots_with_one_id_are_told() -> Verdict {
-    let daemon = world().with(TELLER)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let robot = "mishap-duplicates";
-    let of = ("teller_py", "teller_py", "teller.py");
-    let stub = site.stub(&daemon, of, robot, &[])?;
-    site.until(&app, "the node", |graph| {
-        graph.topics.contains_key("/teller/told")
-    })
-    .with_context(|| stub.said())?;
-    // Another machine has another id, and a Master of its own.
-    let machine = Machine::with_stub(&daemon, "teller_py")?;
-    let port = free_port()?;
-    let script = format!(
-        r#"set -e
-echo 0123456789abcdef0123456789abcdef > /etc/machine-id
-sh teller_py-stub/install.sh --robot {robot}
-. /opt/cloudroid/setup.sh
-export ROS_MASTER_URI=http://localhost:{port} CLOUDROID_LOCAL=none
-rosmaster --core -p {port} > /dev/null 2>&1 &
-exec timeout 60 rosrun teller_py teller.py"#
-    );
-    machine.runs("bash", &script)?.failed_saying(&[
-        ") is connected as this robot and runs /teller; give one of them another id",
-        "CLOUDROID_ROBOT",
-    ])?;
-    let mut told = site.hears(&app, "/teller/told")?;
-    site.next(&mut told).context("the first goes on")?;
+/// Runs a program as if this machine had been booted another time: by that it is known to be another.
+const ELSEWHERE: &str = r#"#!/bin/sh
+exec unshare --mount --propagation private sh -ec '
+  mount --bind "${0%/*}/boot_id" /proc/sys/kernel/random/boot_id
+  exec "$@"' "$0" "$@"
+"#;
+
+pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let (service, package, executable) = twin.names();
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = &*twin.robot("mishap-duplicates");
+    let argv = twin.argv("greeter", &[("~name", "/who")]);
+    let stub = twin.stub(&site, (&daemon.address, robot), "", &argv)?;
+    let answers = || -> Verdict {
+        let names = site.says(&app, "/who", false)?;
+        site.connected(&*names, 1)?;
+        let mut greetings = site.hears(&app, "/greeter/greeting")?;
+        site.fed(&greetings, 1)?;
+        names.publish(string_of(WireFormat::of(ros), "robot"));
+        site.next(&mut greetings).map(drop)
+    };
+    answers().with_context(|| stub.said())?;
+    // Another machine has another id, and a ROS system of its own.
+    let place = world().directory("elsewhere")?;
+    let elsewhere = place.path().join("run");
+    std::fs::write(&elsewhere, ELSEWHERE)?;
+    std::fs::set_permissions(&elsewhere, Permissions::from_mode(0o755))?;
+    let boot = "01234567-89ab-4def-8123-456789abcdef\n";
+    std::fs::write(place.path().join("boot_id"), boot)?;
+    let other = Site::of(ros)?;
+    let settings = format!("robot = \"{robot}\"\nlocal = \"none\"\n");
+    let overlay = other.installs(&daemon, service, &settings)?;
+    let start = |node: &str| {
+        let argv = twin.argv(node, &[("~name", "/who")]);
+        let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
+        other.emulates(path_str(&elsewhere), &overlay, package, executable, &argv)
+    };
+    refused(
+        start("greeter")?,
+        &[
+            ") is connected as this robot and runs /greeter; give one of them another id",
+            "CLOUDROID_ROBOT",
+        ],
+    )?;
+    answers().context("the first goes on")?;
     // Another node of the package would share the servant: both sides and the server say so.
-    let script = script
-        .replace("exec timeout 60 rosrun teller_py teller.py", "rosrun teller_py teller.py __name:=other > said 2>&1 & node=$!\nuntil grep 'two machines' said; do kill -0 $node; sleep 0.1; done\nkill -INT $node; wait $node || true");
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
-    for said in [outcome.stdout, stub.said()] {
+    let neighbour = start("other")?;
+    for stub in [&neighbour, &stub] {
+        stub.says("two machines are connected as this robot: ")?;
+        let said = stub.said();
         ensure!(
-            said.contains("two machines are connected as this robot: ")
-                && said.contains(" runs /other")
-                && said.contains("CLOUDROID_ROBOT"),
+            said.contains(" runs /other") && said.contains("CLOUDROID_ROBOT"),
             "{said}"
         );
     }
@@ -266,25 +341,120 @@ cat said"#
     Ok(())
 }
 
-pub fn a_missing_original_is_said_once_and_the_cloud_goes_on() -> Verdict {
-    let daemon = world().with(GREETER)?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
+pub fn a_missing_original_is_said_once_and_the_cloud_goes_on(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let (service, package, executable) = twin.names();
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
     // No answer is as quick, so each counts as late and the local original is wanted.
-    let settings = "robot = \"mishap-missing\"\ndesire = 0.000001\nmax = 0.000002\n";
-    let overlay = site.installs(&daemon, "greeter_cpp", settings)?;
-    let stub = site.runs(&overlay, "greeter_cpp", "greeter", &["~name:=/who"])?;
+    let robot = twin.robot("mishap-missing");
+    let settings = format!("robot = \"{robot}\"\ndesire = 0.000001\nmax = 0.000002\n");
+    let overlay = site.installs(&daemon, service, &settings)?;
+    let argv = twin.argv("greeter", &[("~name", "/who")]);
+    let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
+    let stub = site.runs(&overlay, package, executable, &argv)?;
     let names = site.says(&app, "/who", false)?;
     site.connected(&*names, 1).with_context(|| stub.said())?;
     let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    site.fed(&greetings, 1).with_context(|| stub.said())?;
     for number in 0..8 {
-        names.publish(string(&format!("robot {number}")));
+        let name = string_of(WireFormat::of(ros), &format!("robot {number}"));
+        names.publish(name);
         site.next(&mut greetings).with_context(|| stub.said())?;
     }
     let said = stub.said();
     let times = said.matches("there is no local original").count();
     ensure!(times == 1, "{times} times: {said}");
     Ok(())
+}
+
+/// A greeter and its original as they are installed on a robot, with these variables in their environment.
+fn installed(
+    site: &Site,
+    daemon: &Daemon,
+    twin: &Twin,
+    settings: &str,
+    variables: &[(&str, &str)],
+) -> anyhow::Result<Running> {
+    let (service, package, executable) = twin.names();
+    let overlay = site.installs(daemon, service, settings)?;
+    let program = twin.program();
+    let workspace = site.installs_original(daemon, service, (package, executable), &program)?;
+    let prefixes = format!("{}:{}", overlay.display(), workspace.display());
+    let workspaces = match twin.ros {
+        RosVersion::One => "CMAKE_PREFIX_PATH",
+        RosVersion::Two => "AMENT_PREFIX_PATH",
+    };
+    let variables = [
+        &[(workspaces, prefixes.as_str()), ("NO_COLOR", "1")],
+        variables,
+    ]
+    .concat();
+    let argv = twin.argv("greeter", &[("~name", "/who")]);
+    let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
+    site.runs_among(&variables, &overlay, package, executable, &argv)
+}
+
+/// Names somebody until a greeter of whichever side answers.
+fn is_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &Running) -> Verdict {
+    let names = site.says(app, "/who", false)?;
+    let mut greetings = site.hears(app, "/greeter/greeting")?;
+    let mut number = 0;
+    support::until("a greeting", || {
+        number += 1;
+        let name = format!("robot {number}");
+        names.publish(string_of(WireFormat::of(site.system.version()), &name));
+        let heard = site.next_within(&mut greetings, Duration::from_millis(200))?;
+        Ok(heard.map(drop).ok_or_else(|| stub.said()))
+    })
+}
+
+/// The original that a stub has started, once it is more than the shell that starts it.
+fn original_of(stub: &Running, program: &str) -> Option<i32> {
+    let path = format!("/proc/{0}/task/{0}/children", stub.pid());
+    let children = std::fs::read_to_string(path).ok()?;
+    let mut children = children
+        .split_whitespace()
+        .filter_map(|pid| pid.parse().ok());
+    children.find(|pid| {
+        let line = procfs::command_line(*pid).unwrap_or_default();
+        // An interpreter may stand before it.
+        line.split(' ').take(2).any(|word| word == program)
+    })
+}
+
+pub fn an_original_that_crashes_is_told_and_started_again(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let robot = twin.robot("mishap-crash-here");
+    let settings = format!("robot = \"{robot}\"\nlocal = \"warm\"\ndesire = 60.0\nmax = 60.0\n");
+    let stub = installed(&site, &daemon, &twin, &settings, &[])?;
+    is_greeted(&site, &app, &stub)?;
+    let program = twin.program();
+    let runs = |but: i32| {
+        support::until("an original", || {
+            let runs = original_of(&stub, &program).filter(|pid| *pid != but);
+            Ok(runs.ok_or_else(|| stub.said()))
+        })
+    };
+    let first = runs(0)?;
+    kill(Pid::from_raw(first), Signal::SIGKILL)?;
+    let second = runs(first)?;
+    let said = stub.said();
+    ensure!(
+        said.matches("the local original ended").count() == 1 && said.contains("signal: 9"),
+        "{said}"
+    );
+    is_greeted(&site, &app, &stub)?;
+    // It ends with a stub that is killed.
+    stub.signal(Signal::SIGKILL)?;
+    support::until("its end", || {
+        let line = procfs::command_line(second).filter(|line| !line.is_empty());
+        Ok(line.map_or(Ok(()), Err))
+    })
 }
 
 /// With the original below /usr and `local = "warm"`; its process is killed, and later the whole launch is ended.
@@ -344,33 +514,20 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
     Ok(())
 }
 
-pub fn a_service_that_is_gone_leaves_the_local_original() -> Verdict {
-    let daemon = world().with(TELLER)?;
-    let machine = Machine::with_stub(&daemon, "teller_py")?;
-    machine.has_teller()?;
-    let script = format!(
-        r#"set -e
-sh teller_py-stub/install.sh --robot mishap-gone > /dev/null
-sed -i 's/^service = .*/service = "nobody"/' /opt/cloudroid/share/teller_py/stub.toml
-. /opt/cloudroid/setup.sh
-export ROS_MASTER_URI=http://localhost:{port}
-rosmaster --core -p {port} > /dev/null 2>&1 & master=$!
-until rosparam list > /dev/null 2>&1; do kill -0 $master; sleep 0.1; done
-rosrun teller_py teller.py > said 2>&1 &
-timeout 60 rostopic echo -n 1 -p /teller/told; cat said"#,
-        port = free_port()?
-    );
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
-    for words in [
-        "nobody",
-        "running the local original instead",
-        "life 1 of /teller",
-    ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words:?}: {}",
-            outcome.said()
-        );
-    }
+pub fn a_service_that_is_gone_leaves_the_local_original(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let daemon = world().with(twin.service)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let settings = format!("robot = \"{}\"\n", twin.robot("mishap-gone"));
+    let gone = [("CLOUDROID_SERVICE", "nobody")];
+    let stub = installed(&site, &daemon, &twin, &settings, &gone)?;
+    stub.says("running the local original instead")?;
+    ensure!(stub.said().contains("nobody"), "{}", stub.said());
+    is_greeted(&site, &app, &stub)?;
+    // What was the stub is the original now.
+    let line = procfs::command_line(i32::try_from(stub.pid())?);
+    let line = line.context("it runs")?;
+    ensure!(line.contains(&twin.program()), "{line}");
     Ok(())
 }

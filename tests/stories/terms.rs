@@ -1,19 +1,22 @@
 //! What robots state is what they get, as the kernel has it.
 
+use std::sync::Arc;
+
 use anyhow::{Context, ensure};
 use nix::sys::signal::Signal;
-use ros::bus::{GlobalParameters, Graph, ParamValue};
+use ros::bus::{Bus, Graph, ParamValue, RosVersion, WireFormat};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::Robot;
-use support::site::{Site, string};
+use support::site::{Site, string_of};
+use support::twins::Twin;
 use support::world::{FIXTURE, GREETER, Service, world};
 
 const MIB: u64 = 1 << 20;
 
 /// A daemon with classes, and the greeter with a dictionary.
-fn daemon(name: &str) -> anyhow::Result<Daemon> {
+fn daemon(name: &str, twin: &Twin) -> anyhow::Result<Daemon> {
     let daemon = world()
         .own(name)
         .config(
@@ -22,9 +25,10 @@ fn daemon(name: &str) -> anyhow::Result<Daemon> {
         )
         .start()?;
     let deployer = daemon.deployer();
+    let (service, package, executable) = twin.names();
     let push = [
         "--node",
-        "greeter",
+        executable,
         "--param",
         "word=hi",
         "--cpus",
@@ -36,13 +40,13 @@ fn daemon(name: &str) -> anyhow::Result<Daemon> {
         "--max-rrt",
         "300ms",
     ];
-    deployer.pushes("greeter_cpp", &push)?.succeeded()?;
+    deployer.pushes(package, &push)?.succeeded()?;
     for row in [
         ["--rrt", "200ms", "--cpus", "0.25", "--memory", "128M"],
         ["--rrt", "100ms", "--cpus", "0.75", "--memory", "192M"],
         ["--rrt", "50ms", "--cpus", "2", "--memory", "256M"],
     ] {
-        let verb = ["sla", "set", "greeter_cpp"];
+        let verb = ["sla", "set", service];
         deployer
             .types(&[&verb[..], &row[..]].concat())?
             .succeeded()?;
@@ -52,7 +56,16 @@ fn daemon(name: &str) -> anyhow::Result<Daemon> {
 
 /// Cores and MiB that are in force for a robot's servant.
 fn in_force(daemon: &Daemon, robot: &str) -> anyhow::Result<(Option<f64>, Option<u64>, Value)> {
-    let servant = daemon.servant_of("greeter_cpp", robot)?;
+    in_force_of(daemon, GREETER.name, robot)
+}
+
+/// The same of a service.
+fn in_force_of(
+    daemon: &Daemon,
+    service: &str,
+    robot: &str,
+) -> anyhow::Result<(Option<f64>, Option<u64>, Value)> {
+    let servant = daemon.servant_of(service, robot)?;
     let enforced = &servant["enforced"];
     let memory = enforced["memory"].as_u64().map(|bytes| bytes / MIB);
     Ok((enforced["cpus"].as_f64(), memory, servant))
@@ -70,7 +83,7 @@ fn refusal(daemon: &Daemon, path: &str) -> anyhow::Result<(u16, Value)> {
 }
 
 pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
-    let daemon = daemon("terms")?;
+    let daemon = daemon("terms", &Twin::greeter(RosVersion::One))?;
     let deployer = daemon.deployer();
     let listed = deployer
         .types(&["sla", "list", "greeter_cpp"])?
@@ -224,25 +237,52 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     Ok(())
 }
 
-pub fn a_stub_states_what_its_robot_says_before_it_is_admitted() -> Verdict {
-    let daemon = daemon("terms-stub")?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let serves = |graph: &Graph| graph.services.contains_key("/greeter/count");
-    let run = |state: &[(&str, ParamValue)]| -> anyhow::Result<Value> {
-        for (key, value) in state {
+/// Says a setting of the stub as robots of its ROS do: on the parameter server, or in the command line.
+fn says_setting(
+    site: &Site,
+    app: &Arc<dyn Bus>,
+    argv: &mut Vec<String>,
+    key: &str,
+    value: &ParamValue,
+) -> Verdict {
+    match app.parameters() {
+        Ok(parameters) => {
             let name = format!("/greeter/cloudroid/{key}");
-            site.runtime.block_on(app.set(&name, value.clone()))?;
+            site.runtime
+                .block_on(parameters.set(&name, value.clone()))?;
         }
-        let overlay = site.installs(
-            &daemon,
-            "greeter_cpp",
-            "robot = \"linked\"\nlocal = \"none\"\n",
-        )?;
-        let mut stub = site.runs(&overlay, "greeter_cpp", "greeter", &[])?;
+        Err(_) => {
+            let value = match value {
+                ParamValue::Double(number) => number.to_string(),
+                ParamValue::String(text) => text.clone(),
+                other => anyhow::bail!("{other:?}"),
+            };
+            argv.extend(["-p".to_owned(), format!("cloudroid.{key}:={value}")]);
+        }
+    }
+    Ok(())
+}
+
+pub fn a_stub_states_what_its_robot_says_before_it_is_admitted(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let (service, package, executable) = twin.names();
+    let daemon = daemon(&twin.robot("terms-stub"), &twin)?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let serves = |graph: &Graph| graph.services.contains_key("/greeter/count");
+    // It goes on to say what it has said.
+    let mut argv = twin.argv("greeter", &[]);
+    let mut run = |state: &[(&str, ParamValue)]| -> anyhow::Result<Value> {
+        for (key, value) in state {
+            says_setting(&site, &app, &mut argv, key, value)?;
+        }
+        let settings = "robot = \"linked\"\nlocal = \"none\"\n";
+        let overlay = site.installs(&daemon, service, settings)?;
+        let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
+        let mut stub = site.runs(&overlay, package, executable, &argv)?;
         let there = site.until(&app, "the service", serves);
         there.with_context(|| format!("the stub said:\n{}", stub.said()))?;
-        let (_, _, servant) = in_force(&daemon, "linked")?;
+        let (_, _, servant) = in_force_of(&daemon, service, "linked")?;
         stub.signal(Signal::SIGINT)?;
         stub.ends()?;
         site.until(&app, "its end", |graph| !serves(graph))?;
@@ -360,35 +400,45 @@ pub fn a_robot_that_says_nothing_of_its_pictures_pays_for_those_that_it_sends() 
     Ok(())
 }
 
-pub fn what_a_stub_passes_on_is_measured_as_well() -> Verdict {
-    let daemon = sized("measured-stub", &GREETER, "bytes", ["1000", "100000"])?;
-    let site = Site::new()?;
-    let app = site.node("/app")?;
-    let stated = [("desire", 0.1), ("max", 0.2)];
-    for (key, value) in stated {
-        let name = format!("/greeter/cloudroid/{key}");
-        site.runtime
-            .block_on(app.set(&name, ParamValue::Double(value)))?;
+pub fn what_a_stub_passes_on_is_measured_as_well(ros: RosVersion) -> Verdict {
+    let twin = Twin::greeter(ros);
+    let (service, package, executable) = twin.names();
+    let name = twin.robot("measured-stub");
+    let daemon = sized(&name, &twin.service, "bytes", ["1000", "100000"])?;
+    let site = Site::of(ros)?;
+    let app = site.joins("/app")?;
+    let mut argv = twin.argv("greeter", &[]);
+    for (key, value) in [("desire", 0.1), ("max", 0.2)] {
+        says_setting(&site, &app, &mut argv, key, &ParamValue::Double(value))?;
     }
-    let overlay = site.installs(
-        &daemon,
-        "greeter_cpp",
-        "robot = \"linked\"\nlocal = \"none\"\n",
-    )?;
-    let stub = site.runs(&overlay, "greeter_cpp", "greeter", &[])?;
+    let settings = "robot = \"linked\"\nlocal = \"none\"\n";
+    let overlay = site.installs(&daemon, service, settings)?;
+    let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
+    let stub = site.runs(&overlay, package, executable, &argv)?;
     let serves = |graph: &Graph| graph.services.contains_key("/greeter/count");
     let there = site.until(&app, "the service", serves);
     there.with_context(|| format!("the stub said:\n{}", stub.said()))?;
-    ensure!(in_force(&daemon, "linked")?.0 == Some(1.5));
+    let cores = || Ok::<_, anyhow::Error>(in_force_of(&daemon, service, "linked")?.0);
+    ensure!(cores()? == Some(1.5));
     let names = site.says(&app, "/greeter/name", false)?;
     site.connected(&*names, 1)?;
+    let says = |name: &str| {
+        let name = string_of(WireFormat::of(ros), name);
+        names.publish(name.clone());
+        match ros {
+            RosVersion::One => name.len(),
+            // RTPS carries whole words.
+            RosVersion::Two => name.len().next_multiple_of(4),
+        }
+    };
+    let mut size = 0;
     for _ in 0..10 {
-        names.publish(string("ada"));
+        size = says("ada");
     }
-    resized(&daemon, "bytes=7")?;
-    ensure!(in_force(&daemon, "linked")?.0 == Some(0.5));
-    names.publish(string(&"a".repeat(5000)));
-    resized(&daemon, "bytes=5004")?;
-    ensure!(in_force(&daemon, "linked")?.0 == Some(1.5));
+    resized(&daemon, &format!("bytes={size}"))?;
+    ensure!(cores()? == Some(0.5));
+    let size = says(&"a".repeat(5000));
+    resized(&daemon, &format!("bytes={size}"))?;
+    ensure!(cores()? == Some(1.5));
     Ok(())
 }

@@ -23,6 +23,7 @@ pub mod ros_system;
 pub mod shaper;
 pub mod site;
 pub mod tls;
+pub mod twins;
 pub mod wire;
 pub mod world;
 

@@ -609,3 +609,14 @@ pub fn string_of(format: WireFormat, text: &str) -> Bytes {
         .concat()
         .into()
 }
+
+/// The text that a message ends with, behind so many bytes of flags.
+pub fn text_of(version: RosVersion, message: &[u8], flags: usize) -> anyhow::Result<String> {
+    let at = match version {
+        RosVersion::One => flags + 4,
+        RosVersion::Two => 4 + flags.next_multiple_of(4) + 4,
+    };
+    let text = message.get(at..).context("too short")?;
+    let text = String::from_utf8_lossy(text);
+    Ok(text.trim_end_matches('\0').to_owned())
+}
