@@ -5,6 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 
+use crate::archive::Archive;
+use crate::base::Base;
 use crate::build::{Build, Parts};
 use crate::deb::Member;
 use crate::error::Error;
@@ -86,18 +88,9 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
 
 /// Of ROS 2, whose archive has one Debian package for each ROS package, with all that it needs.
 async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
-    let (archive, base) = (&build.archive, &build.base);
-    let own = format!("ros-{}-", base.ros_distribution);
-    let plain = name.strip_prefix(&own).unwrap_or(name).replace('-', "_");
-    let Some(deb) = keys::deb_of(archive, base, &plain) else {
-        return Err(Error::NotInRosArchive {
-            name: name.to_owned(),
-            base: base.name.clone(),
-            distribution: base.ros_distribution.clone(),
-        });
-    };
+    let InArchive { package, deb } = in_archive(&build.archive, &build.base, name)?;
     let (_, mut debs) = build.extra_packages().await?;
-    let version = archive.candidates.get(&deb);
+    let version = build.archive.candidates.get(&deb);
     debs.insert(deb);
     let mapped = build.request.map.values();
     let mapped = mapped.flat_map(|debs| debs.split([',', ' ']));
@@ -107,14 +100,35 @@ async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
         .await?;
     Ok(Parts {
         versions: BTreeMap::from([(
-            plain.clone(),
+            package.clone(),
             version.map_or_else(String::new, |deb| deb.version),
         )]),
-        packages: vec![plain],
+        packages: vec![package],
         dependencies,
         package: Made::default(),
         prefix: None,
     })
+}
+
+/// A ROS package and the Debian package that holds it.
+#[derive(Debug, PartialEq)]
+struct InArchive {
+    package: String,
+    deb: String,
+}
+
+/// `name` is that of the ROS package, or of the Debian package, with or without what it begins with.
+fn in_archive(archive: &Archive, base: &Base, name: &str) -> Result<InArchive, Error> {
+    let own = format!("ros-{}-", base.ros_distribution);
+    let package = name.strip_prefix(&own).unwrap_or(name).replace('-', "_");
+    match keys::deb_of(archive, base, &package) {
+        Some(deb) => Ok(InArchive { package, deb }),
+        None => Err(Error::NotInRosArchive {
+            name: name.to_owned(),
+            base: base.name.clone(),
+            distribution: base.ros_distribution.clone(),
+        }),
+    }
 }
 
 /// Remembered: it downloads and looks into many packages.
@@ -208,4 +222,49 @@ fn version(build: &Build<'_>, package: &str) -> String {
         .or(carriers.keys().next());
     deb.and_then(|deb| build.archive.candidates.get(deb))
         .map_or_else(String::new, |deb| deb.version)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::contents::{Contents, tests::list};
+
+    #[test]
+    fn packages_of_an_archive_of_ros_2_are_known_by_each_of_their_names() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let lists = [list(directory.path(), "c.gz", "")];
+        let archive = Archive {
+            apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
+            contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
+            candidates: crate::candidates::tests::named(&[
+                "ros-jazzy-demo-nodes-py",
+                "ros-humble-turtlesim",
+                "python3-six",
+            ]),
+            stamp: String::new(),
+            sources: String::new(),
+        };
+        let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
+        let base = crate::base::load(&images, "noble-jazzy").expect("valid");
+        for name in ["demo_nodes_py", "demo-nodes-py", "ros-jazzy-demo-nodes-py"] {
+            let found = in_archive(&archive, &base, name);
+            let expected = InArchive {
+                package: "demo_nodes_py".to_owned(),
+                deb: "ros-jazzy-demo-nodes-py".to_owned(),
+            };
+            assert_eq!(found.expect("it is there"), expected, "{name}");
+        }
+        // Of another distribution, of no ROS, and of nobody.
+        for name in ["turtlesim", "ros-humble-turtlesim", "python3-six", "frob"] {
+            let refused = in_archive(&archive, &base, name).expect_err("it is not there");
+            let refused = refused.to_string();
+            assert!(
+                refused.contains(name) && refused.contains("noble-jazzy"),
+                "{refused}"
+            );
+        }
+    }
 }
