@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
-use ros::bus::{RosVersion, Subscription};
+use ros::bus::{Message, RosVersion, Subscription};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
@@ -95,9 +95,14 @@ impl Scene {
                     self.sent, self.answers
                 )
             })?;
-            let answered = people::number(&message).context("a stamp")?;
-            *self.answers.entry(answered).or_default() += 1;
+            self.notes(&message)?;
         }
+        Ok(())
+    }
+
+    fn notes(&mut self, answer: &Message) -> Verdict {
+        let answered = people::number(answer).context("a stamp")?;
+        *self.answers.entry(answered).or_default() += 1;
         Ok(())
     }
 
@@ -123,8 +128,7 @@ impl Scene {
     /// Notes the next answer, if one comes in a moment.
     fn listens(&mut self) -> Verdict {
         if let Some(answer) = self.site.next_within(&mut self.camera.found, MOMENT)? {
-            let answered = people::number(&answer).context("a stamp")?;
-            *self.answers.entry(answered).or_default() += 1;
+            self.notes(&answer)?;
         }
         Ok(())
     }
