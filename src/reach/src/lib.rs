@@ -37,6 +37,7 @@ mod nodes;
 pub mod readiness;
 mod request_times;
 mod sockets;
+mod succession;
 pub mod tap;
 mod trial;
 

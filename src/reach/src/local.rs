@@ -19,6 +19,7 @@ use crate::lifecycle::Lifecycles;
 use crate::links::Nodes;
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
+use crate::succession::Participants;
 use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, master};
 
 /// The name of our node in every servant's graph.
@@ -64,6 +65,7 @@ impl Opener for LocalOpener {
             budget: options.budget.clone(),
             unfinished: options.unfinished,
             distribution: options.distribution.clone(),
+            succession: Some(Arc::new(Participants::of(&local))),
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));

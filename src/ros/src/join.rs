@@ -1,11 +1,13 @@
 //! How to join a ROS system.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use budget::Budget;
 
 use crate::network::Network;
+use crate::succession::Succession;
 
 /// A message longer than this ends its connection, unless set otherwise.
 pub const MAX_MESSAGE: usize = 256 << 20;
@@ -33,6 +35,8 @@ pub struct JoinOptions {
     pub budget: Budget,
     /// A message that was begun and is not whole after this time ends its connection.
     pub unfinished: Duration,
+    /// In whose place it comes (ROS 2); in nobody's where there is none.
+    pub succession: Option<Arc<dyn Succession>>,
 }
 
 impl JoinOptions {
@@ -48,6 +52,7 @@ impl JoinOptions {
             max_message: MAX_MESSAGE,
             budget: Budget::unlimited(),
             unfinished: UNFINISHED,
+            succession: None,
         }
     }
 

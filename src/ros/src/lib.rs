@@ -20,8 +20,10 @@ pub mod ros1;
 pub mod ros2;
 pub mod schema;
 pub mod sizes;
+mod succession;
 pub mod turns;
 
 pub use connect::connect;
 pub use join::JoinOptions;
 pub use network::{DiscoveryServer, Interface, Interfaces, Network};
+pub use succession::{ParticipantPrefix, Succession};

@@ -18,6 +18,7 @@ mod outgoing;
 mod participants;
 mod paths;
 mod ports;
+mod predecessors;
 mod servers;
 #[cfg(test)]
 mod tests;
@@ -33,6 +34,7 @@ use tokio::sync::watch;
 
 pub(crate) use self::discovering::BUILTIN;
 use self::paths::Path;
+use self::predecessors::Predecessors;
 use self::servers::Via;
 use crate::discovery::ParticipantData;
 use crate::locator::Ports;
@@ -112,6 +114,8 @@ pub(crate) struct Settings {
     pub network: Network,
     /// Whether it tells nobody of itself, and hears nobody.
     pub alone: bool,
+    /// Who ended without a word, and had this participant's lease.
+    pub predecessors: Vec<GuidPrefix>,
 }
 
 /// A participant.
@@ -126,6 +130,7 @@ pub(crate) struct Engine {
     announce_pause: Duration,
     network: Network,
     alone: bool,
+    predecessors: Predecessors,
     /// Which of the domain's ports of this machine were bound when they were looked at last.
     bound: BTreeSet<SocketAddrV4>,
     remotes: HashMap<GuidPrefix, Remote>,
@@ -160,8 +165,10 @@ impl Engine {
             servers,
             network,
             alone,
+            predecessors,
         } = settings;
         let mut engine = Self {
+            predecessors: Predecessors::new(now, predecessors, own.lease),
             own,
             ports,
             bounds,

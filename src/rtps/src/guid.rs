@@ -26,6 +26,14 @@ pub struct GuidPrefix(pub [u8; 12]);
 impl GuidPrefix {
     /// Nobody in particular.
     pub const UNKNOWN: Self = Self([0; 12]);
+
+    /// Nobody else's: the vendor's two bytes, as implementations have it, and ten at random.
+    pub fn random() -> Self {
+        let mut prefix = [0; 12];
+        prefix[..2].copy_from_slice(&VendorId::OURS.0);
+        rand::fill(&mut prefix[2..]);
+        Self(prefix)
+    }
 }
 
 /// Tells an end of a participant apart: three bytes of key, one of kind (9.3.1.2).

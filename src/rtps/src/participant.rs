@@ -72,6 +72,11 @@ pub struct Config {
     /// Servers of discovery of Fast DDS. Where there are some it tells them alone of itself, and hears of others by them: neither by
     /// multicast nor of peers.
     pub servers: Vec<DiscoveryServer>,
+    /// Which participant it is to be; one that nobody else is where there is none.
+    pub prefix: Option<GuidPrefix>,
+    /// Participants in whose place it comes, which ended without a word: others are told in their name that they are gone. They had
+    /// the lease that this one has.
+    pub predecessors: Vec<GuidPrefix>,
 }
 
 /// A server of discovery of Fast DDS, as its clients name it.
@@ -108,6 +113,8 @@ impl Config {
             well_known: false,
             peers: Vec::new(),
             servers: Vec::new(),
+            prefix: None,
+            predecessors: Vec::new(),
         }
     }
 }
@@ -286,6 +293,7 @@ impl Participant {
                 servers: config.servers,
                 network: network.clone(),
                 alone: config.alone,
+                predecessors: config.predecessors,
             },
         );
         let guid = engine.guid();
@@ -465,7 +473,7 @@ fn own_data(
 ) -> io::Result<ParticipantData> {
     let (discovery, user) = (discovery.local_addr()?.port(), user.local_addr()?.port());
     Ok(ParticipantData {
-        prefix: new_prefix(),
+        prefix: config.prefix.unwrap_or_else(GuidPrefix::random),
         vendor: VendorId::OURS,
         version: [2, 3],
         domain: Some(u32::from(config.domain)),
@@ -476,14 +484,6 @@ fn own_data(
         builtin: BUILTIN,
         lease: Some(LEASE),
     })
-}
-
-/// Nobody else's: the vendor's two bytes, as implementations have it, and ten at random.
-fn new_prefix() -> GuidPrefix {
-    let mut prefix = [0; 12];
-    prefix[..2].copy_from_slice(&VendorId::OURS.0);
-    rand::fill(&mut prefix[2..]);
-    GuidPrefix(prefix)
 }
 
 struct End {

@@ -8,6 +8,7 @@
 //! | `log.jsonl`, `log.jsonl.1` | shim | what nodes printed |
 //! | `shim.log` | shim | its own complaints |
 //! | `exit.json` | shim, last thing | [`Exit`] |
+//! | `daemon.json` | daemon, while it runs | what it has to tell the next daemon ([`crate::local::LocalServant::leave`]) |
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -34,6 +35,8 @@ pub const SPEC: &str = "spec.json";
 pub const RUNTIME: &str = "runtime.json";
 /// [`Exit`]'s file.
 pub const EXIT: &str = "exit.json";
+/// What a daemon leaves for the next one.
+pub const DAEMON: &str = "daemon.json";
 /// The shim's socket.
 pub const SOCKET: &str = "shim.sock";
 /// The shim's standard error.

@@ -1,6 +1,7 @@
 """A participant of Cyclone DDS that speaks as rmw_cyclonedds does, without nodes: it relays /ping to /pong, and serves /set.
 
-It calls /ask when it is told to by a line on its standard input, and answers by lines of JSON; the first one says that it is ready.
+It calls /ask when it is told to by a line on its standard input, or says whether somebody serves it, and answers by lines of JSON; the
+first one says that it is ready.
 """
 
 import json
@@ -58,7 +59,9 @@ class Hears(Listener):
 
     def on_data_available(self, reader):
         for sample in reader.take(10):
-            self.take(sample)
+            # Otherwise it says that its writer is gone.
+            if sample.sample_info.valid_data:
+                self.take(sample)
 
 
 participant = DomainParticipant(0)
@@ -88,9 +91,18 @@ replies = writer('rr/setReply', Response)
 requests = reader('rq/setRequest', Request, answer)
 asks = writer('rq/askRequest', Request)
 answers = reader('rr/askReply', Response, answered)
+
+
+def served():
+    # Both ends of the server.
+    return bool(asks.get_matched_subscriptions() and answers.get_matched_publications())
+
+
 say('ready')
 for number, line in enumerate(sys.stdin):
-    # Both ends of the server.
-    while not (asks.get_matched_subscriptions() and answers.get_matched_publications()):
+    if line.split() == ['served']:
+        say('served', served())
+        continue
+    while not served():
         time.sleep(0.01)
     asks.write(Request(client=CLIENT, number=number, data=line.split() == ['call', 'true']))

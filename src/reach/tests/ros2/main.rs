@@ -14,4 +14,5 @@ mod robot;
 mod rosbridge;
 mod servers;
 mod services;
+mod succession;
 mod topics;

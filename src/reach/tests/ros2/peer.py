@@ -55,6 +55,9 @@ class Peer(Node):
     def full(self, info):
         return info.node_namespace.rstrip('/') + '/' + info.node_name
 
+    def served(self):
+        return [self.ask.service_is_ready()]
+
     def call(self, data):
         if not self.ask.wait_for_service(20):
             return ['nobody serves it']

@@ -28,7 +28,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Config, Discovered, JoinError, Participant};
+use rtps::{Config, Discovered, GuidPrefix, JoinError, Participant};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::{AbortHandle, JoinSet};
@@ -105,6 +105,11 @@ impl Ros2Bus {
         if !names::is_global(&options.node) {
             return Err(BusError::BadName(options.node));
         }
+        let prefix = GuidPrefix::random();
+        let predecessors = match &options.succession {
+            Some(succession) => succession.joins(&options.node, prefix.0).await,
+            None => Vec::new(),
+        };
         let network = options.network;
         let config = Config {
             interfaces: network.interfaces,
@@ -117,6 +122,8 @@ impl Ros2Bus {
             max_sample: options.max_message,
             budget: options.budget,
             unfinished: options.unfinished,
+            prefix: Some(prefix),
+            predecessors: predecessors.into_iter().map(GuidPrefix).collect(),
             ..Config::new(options.domain, options.node.clone())
         };
         let joined = Participant::join(Arc::new(Place(sockets)), config).await;

@@ -84,6 +84,7 @@ impl Engine {
     /// Announces this participant where it is due, and lets those go of whom nothing was heard; when to come back.
     pub(super) fn tick_discovery(&mut self, now: Instant) -> Instant {
         if self.announce_at <= now && !self.closed {
+            self.predecessors.tidy(now);
             self.announce();
             self.ask_silent(now);
             self.announce_at = now + self.announce_pause;
@@ -136,35 +137,63 @@ impl Engine {
             .filter(|(to, _)| told.insert(*to))
             .collect();
         for (to, prefix) in all {
-            self.announce_to(to, prefix, 0);
+            self.announce_to(to, prefix);
         }
     }
 
-    pub(super) fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix, status: u32) {
+    /// Tells a participant, or whoever hears it there, of this one.
+    pub(super) fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix) {
+        // First, so that nobody sees both at a time.
+        self.say_goodbye_of_predecessors(to, prefix);
         self.announcements += 1;
-        let key = (status != 0).then(|| self.guid().bytes());
         let data = wire::Data {
             reader: EntityId::SPDP_READER,
             writer: EntityId::SPDP_WRITER,
             number: SequenceNumber(self.announcements),
+            inline: InlineQos::default(),
+            payload: Some(self.own.to_bytes()),
+            key_only: false,
+        };
+        self.tell_of(self.own.prefix, to, prefix, &data);
+    }
+
+    /// Says to them that a participant is gone: this one, or one that cannot say it any more.
+    pub(super) fn say_gone(
+        &mut self,
+        gone: GuidPrefix,
+        number: SequenceNumber,
+        to: SocketAddr,
+        prefix: GuidPrefix,
+    ) {
+        let guid = Guid::new(gone, EntityId::PARTICIPANT);
+        let data = wire::Data {
+            reader: EntityId::SPDP_READER,
+            writer: EntityId::SPDP_WRITER,
+            number,
             inline: InlineQos {
                 related: None,
-                status,
-                key_hash: key,
+                status: DISPOSED,
+                key_hash: Some(guid.bytes()),
             },
-            payload: Some(if status == 0 {
-                self.own.to_bytes()
-            } else {
-                discovery::key(self.guid())
-            }),
-            key_only: status != 0,
+            payload: Some(discovery::key(guid)),
+            key_only: true,
         };
-        let mut writer = wire::DatagramWriter::new(self.own.prefix);
+        self.tell_of(gone, to, prefix, &data);
+    }
+
+    fn tell_of(
+        &mut self,
+        whose: GuidPrefix,
+        to: SocketAddr,
+        prefix: GuidPrefix,
+        data: &wire::Data,
+    ) {
+        let mut writer = wire::DatagramWriter::new(whose);
         if prefix != GuidPrefix::UNKNOWN {
             writer.destination(prefix);
         }
         writer.timestamp(std::time::SystemTime::now().into());
-        writer.data(&data);
+        writer.data(data);
         self.control.push_back(Datagram::whole(to, writer));
     }
 
@@ -179,7 +208,9 @@ impl Engine {
             .map(|remote| (remote.discovery, remote.data.prefix))
             .collect();
         for (to, prefix) in known {
-            self.announce_to(to, prefix, DISPOSED);
+            self.announcements += 1;
+            let number = SequenceNumber(self.announcements);
+            self.say_gone(self.own.prefix, number, to, prefix);
         }
     }
 

@@ -135,7 +135,7 @@ impl Engine {
             Via::Servers => {}
             Via::Named(_) => self.meet_server(now, prefix),
             Via::Itself(_) => {
-                self.announce_to(discovery, prefix, 0);
+                self.announce_to(discovery, prefix);
                 for (index, pair) in ANNOUNCERS.into_iter().enumerate() {
                     let (hears, announces) = (has & HEARS[index] != 0, has & ANNOUNCES[index] != 0);
                     self.match_builtin(now, prefix, pair, hears, announces);

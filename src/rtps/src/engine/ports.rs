@@ -53,7 +53,7 @@ impl Engine {
         if !new.is_empty() {
             if !self.is_client() {
                 for at in new {
-                    self.announce_to(SocketAddr::V4(at), GuidPrefix::UNKNOWN, 0);
+                    self.announce_to(SocketAddr::V4(at), GuidPrefix::UNKNOWN);
                 }
             }
             self.announce_soon(now);

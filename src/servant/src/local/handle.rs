@@ -8,6 +8,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use tokio::io::unix::AsyncFd;
 use tokio::net::UnixStream;
 use tokio::sync::{broadcast, mpsc, watch};
@@ -329,6 +331,18 @@ impl LocalServant {
     /// Its network namespace, to open sockets in; a namespace lives for as long as it is held, also after the servant.
     pub fn network(&self) -> &Arc<NetNs> {
         &self.network
+    }
+
+    /// What this daemon or an earlier one has left for the next; none where there is nothing.
+    pub async fn left<T: DeserializeOwned + Send + 'static>(&self) -> Result<Option<T>, Error> {
+        let path = self.directory.join(launch::DAEMON);
+        privilege::run(async move { launch::read(&path) }).await
+    }
+
+    /// Leaves this for the next daemon in place of what was left before, whole or not at all. It goes with the servant.
+    pub async fn leave<T: Serialize + Send + 'static>(&self, what: T) -> Result<(), Error> {
+        let path = self.directory.join(launch::DAEMON);
+        privilege::run(async move { launch::write(&path, &what) }).await
     }
 
     /// First host uid (= gid) of its range and how many; uid 0 inside is the first.

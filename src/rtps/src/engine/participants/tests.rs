@@ -52,6 +52,7 @@ fn engine(now: Instant) -> Engine {
             servers: Vec::new(),
             network: Network::new(Vec::new()),
             alone: false,
+            predecessors: Vec::new(),
         },
     )
 }

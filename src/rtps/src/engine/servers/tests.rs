@@ -63,6 +63,7 @@ impl World {
             servers: servers.to_vec(),
             network: Network::new(Vec::new()),
             alone: false,
+            predecessors: Vec::new(),
         };
         let client = Engine::new(now, settings);
         Self { now, client }

@@ -1,6 +1,7 @@
 //! Who is there, and when somebody is not any more.
 
 use super::world::{SECOND, World, bound, keep};
+use crate::wire::{self, InlineQos, Submessage};
 use crate::{EntityId, Guid, GuidPrefix};
 
 #[test]
@@ -109,4 +110,76 @@ fn whoever_was_given_up_by_one_side_alone_is_met_again_by_both() {
         assert_eq!(read.marks(), [1, 2], "{forgets} forgets");
         assert_eq!(reader_ends.borrow().confirmed, [writer]);
     }
+}
+
+#[test]
+fn whoever_comes_in_the_place_of_one_that_was_killed_says_its_good_bye() {
+    for (named, there) in [(true, 0), (false, 1)] {
+        let mut world = World::of(2);
+        let (_, ends) = world.writer(0, keep(10));
+        world.reader(1, keep(10));
+        world.pass(SECOND);
+        world.killed.insert(1);
+        let killed = GuidPrefix([2; 12]);
+        world.join_after(&[killed][..usize::from(named)]);
+        world.pass(SECOND / 10);
+        assert_eq!(ends.borrow().matched.len(), there);
+        let discovered = world.engines[0].discovered().borrow().clone();
+        let others: Vec<_> = discovered.participants.keys().copied().collect();
+        let successor = GuidPrefix([3; 12]);
+        let expected = [killed, successor];
+        assert_eq!(others, expected[1 - there..]);
+    }
+}
+
+/// As other implementations want it: they take a good-bye of the announcing writer alone, whose numbers must grow.
+#[test]
+fn a_predecessors_good_bye_comes_from_its_own_writer_with_the_highest_number() {
+    let mut world = World::of(1);
+    let killed = GuidPrefix([9; 12]);
+    world.join_after(&[killed]);
+    let now = world.now;
+    // As it is when it has just joined; a newcomer of whom nothing is known is told as well.
+    world.engines[1].ports_bound(now, &bound([7410]));
+    let mut said = Vec::new();
+    while let Some(datagram) = world.engines[1].transmit(&mut |_, _, _| true) {
+        let parts = datagram.parts();
+        let bytes: Vec<u8> = parts.iter().flat_map(|part| part.to_vec()).collect();
+        said.extend(wire::parse(&bytes.into()).received);
+    }
+    assert_eq!(said.len(), 2, "{said:?}");
+    let [gone, comes] = [0, 1].map(|at| match &said[at].submessage {
+        Submessage::Data(data) => data,
+        other => panic!("{other:?}"),
+    });
+    assert_eq!((said[0].from, said[1].from), (killed, GuidPrefix([2; 12])));
+    assert_eq!(
+        (gone.writer, gone.reader),
+        (EntityId::SPDP_WRITER, EntityId::SPDP_READER)
+    );
+    let key = Guid::new(killed, EntityId::PARTICIPANT).bytes();
+    let disposed = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
+    assert_eq!(
+        (gone.key_only, gone.inline.status, gone.inline.key_hash),
+        (true, disposed, Some(key))
+    );
+    assert!(gone.number.0 > 1 << 31);
+    assert_eq!((comes.inline.status, comes.key_only), (0, false));
+}
+
+#[test]
+fn predecessors_are_spoken_of_until_their_leases_are_over() {
+    let mut world = World::of(2);
+    let killed = GuidPrefix([9; 12]);
+    world.join_after(&[killed]);
+    let said = std::rc::Rc::new(std::cell::Cell::new(0));
+    let count = std::rc::Rc::clone(&said);
+    world.loses = Box::new(move |_, bytes| {
+        count.set(count.get() + usize::from(bytes[8..20] == killed.0));
+        false
+    });
+    world.pass(SECOND * 10);
+    assert!(said.take() > 4, "each may be lost");
+    world.pass(SECOND * 10);
+    assert_eq!(said.get(), 0);
 }

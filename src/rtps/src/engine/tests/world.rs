@@ -53,6 +53,8 @@ pub(super) type Loses = Box<dyn FnMut(usize, &[u8]) -> bool>;
 pub(super) struct World {
     pub(super) now: Instant,
     pub(super) engines: Vec<Engine>,
+    /// Which of them were killed: nothing comes from them, or to them, any more.
+    pub(super) killed: BTreeSet<usize>,
     /// Which of all datagrams are lost, by their number.
     pub(super) loses: Loses,
     sent: usize,
@@ -79,6 +81,7 @@ impl World {
         let mut world = Self {
             now: Instant::now(),
             engines: Vec::new(),
+            killed: BTreeSet::new(),
             loses: Box::new(|_, _| false),
             sent: 0,
             room: None,
@@ -89,6 +92,11 @@ impl World {
     }
 
     pub(super) fn join(&mut self) {
+        self.join_after(&[]);
+    }
+
+    /// One joins in the place of these.
+    pub(super) fn join_after(&mut self, predecessors: &[GuidPrefix]) {
         let index = self.engines.len();
         let at = |port: u16| vec![Locator::from((Ipv4Addr::LOCALHOST, port))];
         let own = ParticipantData {
@@ -122,6 +130,7 @@ impl World {
                 servers: Vec::new(),
                 network: Network::new(Vec::new()),
                 alone: false,
+                predecessors: predecessors.to_vec(),
             },
         ));
     }
@@ -139,8 +148,11 @@ impl World {
             }) {
                 out.push(datagram);
             }
+            carried |= !out.is_empty();
+            if self.killed.contains(&index) {
+                continue;
+            }
             for datagram in out {
-                carried = true;
                 let bytes: Bytes = datagram
                     .parts()
                     .iter()
@@ -151,7 +163,8 @@ impl World {
                     continue;
                 }
                 let to = usize::from((datagram.to.port() - 7410) / 2);
-                if let Some(engine) = self.engines.get_mut(to) {
+                let there = self.engines.get_mut(to);
+                if let Some(engine) = there.filter(|_| !self.killed.contains(&to)) {
                     engine.receive(self.now, HERE, &bytes);
                 }
             }

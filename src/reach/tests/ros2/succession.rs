@@ -1,0 +1,115 @@
+//! Our node is killed, as the daemon's is with it, and comes again: nodes must not wait for the dead one, whose lease goes on.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use ros::bus::{Bus as _, ServiceHandler};
+use ros::ros2::Ros2Bus;
+use ros::{JoinOptions, ParticipantPrefix, Succession};
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+use tokio::time::timeout;
+
+use super::lab::{LONG, Lab, Peer, cdr, of_set_bool, set_bool};
+
+/// What is written down in a servant's directory.
+#[derive(Debug, Default)]
+struct Notes(Mutex<Vec<ParticipantPrefix>>);
+
+#[async_trait]
+impl Succession for Notes {
+    async fn joins(&self, _node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix> {
+        let mut noted = self.0.lock();
+        let earlier = noted.clone();
+        noted.push(participant);
+        earlier
+    }
+}
+
+/// Says which one it is.
+struct Says(&'static str);
+
+#[async_trait]
+impl ServiceHandler for Says {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        let answer = format!(r#"{{"success":true,"message":"{}"}}"#, self.0);
+        Ok(cdr(&set_bool().response, &answer))
+    }
+}
+
+async fn join(lab: &Lab, notes: &Arc<Notes>) -> Arc<Ros2Bus> {
+    let options = JoinOptions {
+        succession: Some(Arc::clone(notes) as _),
+        ..JoinOptions::in_domain(0, "/cloudroid_bridge")
+    };
+    lab.join_with(options).await
+}
+
+/// A node of ours that serves `/ask` until it is killed, which it is by what is returned: nothing of it runs after that, and it says
+/// nothing.
+fn mortal(lab: &Lab, notes: &Arc<Notes>) -> impl FnOnce() {
+    let (kill, killed) = oneshot::channel();
+    let network = Arc::clone(&lab.network);
+    let notes = Arc::clone(notes);
+    let lives = std::thread::spawn(move || {
+        let lab = Lab { network };
+        let mut runtime = tokio::runtime::Builder::new_current_thread();
+        let runtime = runtime.enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            let bus = join(&lab, &notes).await;
+            let served = bus.serve("/ask", of_set_bool(), Arc::new(Says("first")));
+            let served = served.await.unwrap();
+            let _ = killed.await;
+            // Dropped, they would say that they are gone.
+            std::mem::forget((bus, served));
+        });
+        std::mem::forget(runtime);
+    });
+    move || {
+        let _ = kill.send(());
+        lives.join().expect("it served");
+    }
+}
+
+async fn called(peer: &mut Peer) -> [Value; 2] {
+    let answer = peer.obey("call true").await;
+    let (_, last) = answer.split_last_chunk().expect("an answer");
+    last.clone()
+}
+
+async fn nobody_is_believed_in_who_was_killed(program: &str) {
+    let lab = Lab::new();
+    let mut peer = lab.node(program, &[]).await;
+    let notes = Arc::default();
+    let kill = mortal(&lab, &notes);
+    assert_eq!(called(&mut peer).await, [json!(true), json!("first")]);
+    kill();
+    assert_eq!(peer.obey("served").await, [json!(true)]);
+    let begun = Instant::now();
+    let second = join(&lab, &notes).await;
+    let gone = async {
+        while peer.obey("served").await != [json!(false)] {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(LONG, gone).await.expect("in time");
+    // The lease is of 10 s, and was renewed less than 4 s ago.
+    let after = begun.elapsed();
+    assert!(after < Duration::from_secs(4), "{after:?}");
+    let served = second.serve("/ask", of_set_bool(), Arc::new(Says("second")));
+    let _served = served.await.unwrap();
+    assert_eq!(called(&mut peer).await, [json!(true), json!("second")]);
+}
+
+#[tokio::test]
+async fn a_node_of_rclpy_calls_whoever_comes_in_the_place_of_one_that_was_killed() {
+    nobody_is_believed_in_who_was_killed("peer.py").await;
+}
+
+#[tokio::test]
+async fn a_participant_of_cyclone_calls_whoever_comes_in_the_place_of_one_that_was_killed() {
+    nobody_is_believed_in_who_was_killed("cyclone.py").await;
+}
