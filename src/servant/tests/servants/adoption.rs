@@ -16,6 +16,10 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let (uids, network) = (first.uid_range(), Arc::clone(first.network()));
     let enforced = first.enforced();
     let of_first = processes(&first, 2).await;
+    assert_eq!(first.left::<String>().await.unwrap(), None);
+    for what in ["replaced", "of the first"] {
+        first.leave(what).await.unwrap();
+    }
     drop(first);
     let second = world.adopted(&world.restarted()).await;
     assert_eq!(second.id(), id);
@@ -23,6 +27,8 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     assert_eq!(second.nodes(), ["/goes", "/stays"]);
     assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
     assert_eq!(*second.network(), network);
+    let left: Option<String> = second.left().await.unwrap();
+    assert_eq!(left.as_deref(), Some("of the first"));
     assert_eq!(processes(&second, 2).await, of_first, "the same");
     assert!(hear(&second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
