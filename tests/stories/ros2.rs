@@ -125,6 +125,38 @@ pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict 
     robot.subscribes("/tenor_2/song")?;
     let heard = robot.hears_on("/tenor_2/song")?;
     ensure!(heard["data"] == "tenor_2", "{heard}");
+    robot.leaves()?;
+    // On a robot: each is a node, as its program calls it, unless a rule for it alone says otherwise.
+    let site = Site::of(RosVersion::Two)?;
+    let app = site.joins("/app")?;
+    let overlay = site.installs(&daemon, "duets", "local = \"none\"\n")?;
+    let server = format!("ws://{}", daemon.address);
+    let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "choir")];
+    for (argv, second) in [
+        (&[][..], "tenor"),
+        (&["--ros-args", "-r", "tenor:__node:=bass"], "bass"),
+    ] {
+        let mut stub = site.runs_among(&environment, &overlay, "duet_ros2", "duet", argv)?;
+        for name in ["alto", second] {
+            let node = format!("/{name}");
+            let mut songs = site.hears(&app, &format!("{node}/song"))?;
+            let song = with_log(site.next(&mut songs), &stub)?;
+            ensure!(
+                contains(&song.bytes, name) && song.publisher.node() == node,
+                "{song:?}\n{}",
+                stub.said()
+            );
+            let parameters = format!("{node}/get_parameters");
+            let graph = with_log(site.until(&*app, &parameters, serves(&parameters)), &stub)?;
+            ensure!(graph.services[&parameters] == node, "{graph:#?}");
+            let asked = ["use_sim_time".to_owned()];
+            let held = app.node_parameters()?.get(&node, &asked);
+            let held = with_log(site.runtime.block_on(held).map_err(Into::into), &stub)?;
+            ensure!(held == [Some(ParamValue::Bool(false))], "{node}: {held:?}");
+        }
+        stub.signal(Signal::SIGINT)?;
+        stub.ends()?;
+    }
     Ok(())
 }
 

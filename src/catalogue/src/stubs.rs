@@ -133,8 +133,8 @@ pub fn files(
     compose(&about, contents).map_err(no_stub)
 }
 
-/// What nodes of ROS 2 are called by their programs, where each runs once: a robot's launch files seldom name its nodes, and
-/// parameters files go by what those are called. With the namespace where the program gives one (`/camera/detector`), and not where the push has:
+/// What nodes of ROS 2 are called by their programs, where each runs once, or once without being told a name; of a program of several nodes the first. A
+/// robot's launch files seldom name its nodes, and parameters files go by what those are called. With the namespace where the program gives one (`/camera/detector`), and not where the push has:
 /// a robot has its own. ROS 1's always name them.
 fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
     let mut names = BTreeMap::new();
@@ -143,8 +143,11 @@ fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, S
     }
     for (program, path) in &inventory.programs {
         let nodes = revision.plan.nodes.iter();
-        let mut nodes = nodes.filter(|node| node.argv.contains(path));
-        if let (Some(node), None) = (nodes.next(), nodes.next()) {
+        let mut nodes: Vec<_> = nodes.filter(|node| node.argv.contains(path)).collect();
+        if nodes.len() > 1 {
+            nodes.retain(|node| !arguments::gives_name(&node.argv));
+        }
+        if let [node] = &nodes[..] {
             let name = match node.name.rsplit_once('/') {
                 Some(("", name)) => name,
                 Some((_, name)) if arguments::gives_namespace(&node.argv) => name,
@@ -313,6 +316,9 @@ mod tests {
             node.argv.extend(["--ros-args".into(), "-r".into(), rule]);
             node
         };
+        let mut second = node("/alto_2", "/opt/p/lib/p/duet");
+        let rule = ["--ros-args", "-r", "alto:__node:=alto_2"].map(str::to_owned);
+        second.argv.extend(rule);
         let mut revision = RevisionRecord {
             service: "s".into(),
             number: 1,
@@ -330,19 +336,25 @@ mod tests {
                     node("/arm/gripper", "/opt/p/lib/p/gripper"),
                     node("/left", "/opt/p/lib/p/wheel"),
                     node("/right", "/opt/p/lib/p/wheel"),
+                    node("/alto", "/opt/p/lib/p/duet"),
+                    second,
                 ],
                 ..Plan::default()
             },
             interface: Interface::default(),
         };
         let inventory = Inventory {
-            programs: ["camera_node", "gripper", "wheel"]
+            programs: ["camera_node", "gripper", "wheel", "duet"]
                 .map(|name| (name.to_owned(), format!("/opt/p/lib/p/{name}")))
                 .into(),
             ..Inventory::default()
         };
-        // What runs twice says nothing of its own name.
-        let expected = [("camera_node", "camera"), ("gripper", "/arm/gripper")];
+        // What runs twice says nothing of its own name, unless one of them was told no other.
+        let expected = [
+            ("camera_node", "camera"),
+            ("duet", "alto"),
+            ("gripper", "/arm/gripper"),
+        ];
         let expected = expected.map(|(program, node)| (program.to_owned(), node.to_owned()));
         assert_eq!(names(&revision, &inventory), expected.into());
         revision.flavour.ros = Version::Ros1;

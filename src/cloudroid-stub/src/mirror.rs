@@ -33,7 +33,7 @@ use link::drops::{Cause, Drops};
 use link::record::Record;
 use link::{Handler, RobotSession};
 use parking_lot::{Mutex, RwLock};
-use ros::bus::{Bus, ParamValue, WireType};
+use ros::bus::{Bus, NodeNames, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
 
 use calls::Calls;
@@ -166,13 +166,14 @@ impl Mirror {
             }
         }
         *self.siblings.write() = graph.siblings.iter().cloned().collect();
-        applied.graph = Some(graph);
+        applied.told(graph);
         self.register(&applied).await;
     }
 
     async fn register(self: &Arc<Self>, applied: &Applied) {
         let Some(graph) = &applied.graph else { return };
         let keeps = !applied.settled;
+        self.bus.stands_for(applied.nodes.clone());
         self.outputs.apply(self, &graph.outputs, keeps).await;
         self.inputs.apply(self, &graph.inputs, keeps);
         self.calls.apply(self, &graph.services, (true, keeps)).await;
@@ -221,8 +222,29 @@ struct Applied {
     settled: bool,
     /// Told last; none: never.
     graph: Option<Graph>,
+    /// Which of it is whose, with what is kept of the last session.
+    nodes: BTreeMap<String, NodeNames>,
     /// Something was registered without being told.
     stood_in: bool,
+}
+
+impl Applied {
+    fn told(&mut self, graph: Graph) {
+        let told = graph.nodes.iter();
+        let told = told.map(|(node, has)| (node.clone(), NodeNames::from(has.clone())));
+        if self.settled {
+            self.nodes = told.collect();
+        } else {
+            // What it does not list yet stays registered, and whose it is, too.
+            for (node, names) in told {
+                let known = self.nodes.entry(node).or_default();
+                known.publishes.extend(names.publishes);
+                known.subscribes.extend(names.subscribes);
+                known.serves.extend(names.serves);
+            }
+        }
+        self.graph = Some(graph);
+    }
 }
 
 /// A session's node may have just been started, and registers one thing after the other: for so long what was
@@ -235,6 +257,9 @@ async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
     let mut applied = mirror.applied.lock().await;
     if Weak::ptr_eq(&applied.session, &session) {
         applied.settled = true;
+        if let Some(graph) = applied.graph.take() {
+            applied.told(graph);
+        }
         mirror.register(&applied).await;
     }
 }

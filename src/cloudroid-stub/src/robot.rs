@@ -23,8 +23,8 @@ pub struct Robot {
     pub place: Place,
     /// Absolute name of the node.
     pub node: String,
-    /// Arguments for the node in the cloud: what its name and its namespace follow from is left out, and parameters that stand in
-    /// files of the robot are written out.
+    /// Arguments for the node in the cloud: what its name and its namespace follow from is left out in ROS 1, and said in ROS 2, where a program may be
+    /// several nodes; parameters that stand in files of the robot are written out.
     pub argv: Vec<String>,
     /// Arguments for the local original.
     pub original_argv: Vec<String>,
@@ -55,19 +55,28 @@ pub enum Place {
     },
 }
 
+/// What a node is called where the robot does not say it.
+#[derive(Debug, Clone, Copy)]
+pub struct Usual<'a> {
+    /// Its name; in ROS 2 with the namespace that its program gives it.
+    pub name: &'a str,
+    /// Its program calls it so, and is not to be told.
+    pub by_program: bool,
+}
+
 impl Robot {
-    /// Reads `argv` (without the program) of the executable, whose default node name is `usual`.
+    /// Reads `argv` (without the program) of the executable, whose node is usually called so.
     ///
     /// # Errors
     /// The argument, the file or the variable that cannot be, and why.
     pub async fn read(
         argv: &[String],
-        usual: &str,
+        usual: Usual<'_>,
         ros: RosVersion,
         variable: Variable<'_>,
     ) -> anyhow::Result<Self> {
         match ros {
-            RosVersion::One => ros1::read(argv, usual, variable),
+            RosVersion::One => ros1::read(argv, usual.name, variable),
             RosVersion::Two => ros2::read(argv, usual, variable).await,
         }
     }
@@ -101,6 +110,7 @@ impl Robot {
             directory: directory.to_string_lossy().into_owned(),
             revision: made_of.revision,
             image: made_of.image,
+            named_by_argv: self.ros == RosVersion::Two,
         }
     }
 }

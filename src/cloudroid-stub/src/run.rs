@@ -35,7 +35,7 @@ use crate::original;
 use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
-use crate::robot::{Place, Robot, usual_name};
+use crate::robot::{Place, Robot, Usual, usual_name};
 
 /// Where no T_max is given, a link silent for so long counts as down.
 const SILENT: Duration = Duration::from_secs(2);
@@ -56,17 +56,19 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
     let config = config::read(share, std::env::vars())?;
     let made_of = Revision::read(share);
     let executable = &asked.node.node;
-    let named = config
-        .nodes
-        .get(executable)
-        .or(made_of.names.get(executable));
-    let usual = named.cloned().unwrap_or_else(|| usual_name(executable));
+    let found = made_of.names.get(executable);
+    let set = config.nodes.get(executable);
+    let guessed = usual_name(executable);
+    let usual = Usual {
+        name: set.or(found).unwrap_or(&guessed),
+        by_program: found.is_some() && set.is_none_or(|set| Some(set) == found),
+    };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
     let ros = made_of.ros();
     let variable = |name: &str| std::env::var(name).ok();
-    let robot = runtime.block_on(Robot::read(&asked.argv, &usual, ros, &variable))?;
+    let robot = runtime.block_on(Robot::read(&asked.argv, usual, ros, &variable))?;
     let end = runtime.block_on(live(asked, config.clone(), &robot))?;
     // Whatever still runs elsewhere (a codec, say) is not waited for.
     runtime.shutdown_background();

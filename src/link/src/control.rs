@@ -1,9 +1,9 @@
 //! What the two ends tell each other beside messages and calls: JSON, since it is seldom and will grow. Fields unknown
 //! to a reader are ignored, those absent have a default, so a minor addition needs no new version.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use ros::bus::ParamValue;
+use ros::bus::{NodeNames, ParamValue};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -71,8 +71,11 @@ pub struct Node {
     pub package: String,
     /// The executable below its libexec directory.
     pub executable: String,
-    /// Arguments, remaps and private parameters; nothing that begins with `__`.
+    /// Arguments, remaps and private parameters; nothing that begins with `__` in ROS 1.
     pub argv: Vec<String>,
+    /// All that the robot calls the program's nodes stands in `argv`; `name` is what the first of them is called then. Else all of them are called so, as
+    /// by earlier stubs of ROS 2 and in ROS 1, where it is one.
+    pub named_by_argv: bool,
     /// ROS_NAMESPACE.
     pub namespace: String,
     /// The stub's share directory: paths into it mean the same files of the package in the cloud.
@@ -372,6 +375,42 @@ pub struct Graph {
     pub services: Vec<Served>,
     /// Other nodes of the same servant: what they publish on the robot is not sent up again.
     pub siblings: Vec<String>,
+    /// Which of all this is whose, by the nodes' names, where the program is several nodes (ROS 2). Stubs that do not know it have it all for their
+    /// own node.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub nodes: BTreeMap<String, Has>,
+}
+
+/// What one of several nodes has, by name.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Has {
+    /// What it publishes.
+    pub outputs: BTreeSet<String>,
+    /// What it subscribes to.
+    pub inputs: BTreeSet<String>,
+    /// What it serves.
+    pub services: BTreeSet<String>,
+}
+
+impl From<NodeNames> for Has {
+    fn from(names: NodeNames) -> Self {
+        Self {
+            outputs: names.publishes,
+            inputs: names.subscribes,
+            services: names.serves,
+        }
+    }
+}
+
+impl From<Has> for NodeNames {
+    fn from(has: Has) -> Self {
+        Self {
+            publishes: has.outputs,
+            subscribes: has.inputs,
+            serves: has.services,
+        }
+    }
 }
 
 /// An output.
@@ -471,6 +510,7 @@ mod tests {
         assert_eq!((hello.next, hello.attempt), (5, 0));
         assert_eq!(hello.resume.unwrap().ahead, [6]);
         assert_eq!((hello.node.name.as_str(), hello.sla.max), ("/n", Some(0.3)));
+        assert!(!hello.node.named_by_argv);
         let welcome = r#"{"accepted":{"session":"s","resumed":true,"received":1,"ahead":[],"next":2,"servant":"v"}}"#;
         let welcome: Welcome = serde_json::from_str(welcome).unwrap();
         assert!(matches!(welcome, Welcome::Accepted { next: 2, .. }));
@@ -495,6 +535,7 @@ mod tests {
             r#"{"graph":{"outputs":[{"channel":1,"topic":"/t","type":"p/T","md5":"0"}],
                 "inputs":[{"topic":"/t","type":"*","md5":"*","feed":true}],
                 "services":[{"channel":2,"name":"/s","type":"p/S","md5":"0"}],"siblings":["/m"]}}"#,
+            r#"{"graph":{"nodes":{"/n":{"outputs":["/t"]}}}}"#,
             r#"{"exited":{"code":0,"signal":null,"text":"t"}}"#,
             r#"{"notice":{"warning":true,"text":"t"}}"#,
             r#"{"line":{"error":false,"text":"t"}}"#,

@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use crate::links::Nodes;
-use crate::{Observer, following};
+use crate::{Linked, Observer, following};
 
 /// For a container to serve what loads nodes, and for each node to be made: some load what they need then.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -129,7 +129,9 @@ impl Followed {
 
     async fn one(self: Arc<Self>, name: String) {
         let linked = self.nodes.running().await;
-        if linked.iter().any(|linked| linked.node.name == name) {
+        let graph = self.bus.graph().borrow().clone();
+        let has = |linked: &Linked| graph.is_of_process(&linked.node.name, &name);
+        if linked.iter().any(has) {
             return;
         }
         self.show(&name, Load::Loading);

@@ -17,7 +17,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use crate::links::Nodes;
-use crate::{Observer, following};
+use crate::{Linked, Observer, following};
 
 /// For one transition: nodes load what they need then.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -99,7 +99,9 @@ impl Followed {
     async fn one(self: Arc<Self>, name: String) {
         let node = LifecycleNode::of(Arc::clone(&self.bus), &name);
         let linked = self.nodes.running().await;
-        if !linked.iter().any(|linked| linked.node.name == name) {
+        let graph = self.bus.graph().borrow().clone();
+        let has = |linked: &Linked| graph.is_of_process(&linked.node.name, &name);
+        if !linked.iter().any(has) {
             self.put(&name, |stage| stage.begins = true);
             self.begin(&node, &name).await;
             self.put(&name, |stage| stage.begins = false);

@@ -36,7 +36,7 @@ use std::time::Duration;
 
 use budget::Budget;
 use parking_lot::Mutex;
-use ros::bus::{Bus, ParamValue, RosVersion};
+use ros::bus::{Bus, Graph, ParamValue, RosVersion};
 use ros::schema::Registry;
 use ros::sizes::{Inputs, Seen};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -403,9 +403,12 @@ impl Hub {
             .map(|link| link.node.clone())
     }
 
-    fn siblings(&self, node: &str) -> Vec<String> {
+    /// The nodes of other links, with all that their processes are.
+    fn siblings(&self, graph: &Graph, node: &str) -> Vec<String> {
         let links = self.links.lock();
-        links.keys().filter(|name| *name != node).cloned().collect()
+        let others = links.keys().filter(|name| *name != node);
+        let nodes: BTreeSet<String> = others.flat_map(|name| graph.of_process(name)).collect();
+        nodes.into_iter().collect()
     }
 
     /// Takes the link out of reach.

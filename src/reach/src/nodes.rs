@@ -12,7 +12,7 @@ use futures_util::FutureExt;
 use link::control::{Decision, Exit, Node, Request};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
-use ros::flavour::Identity;
+use ros::flavour::{Identity, Naming};
 use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
@@ -120,6 +120,24 @@ pub(crate) fn running<'a>(
     })
 }
 
+/// What a program is told of its nodes' names: nothing that the robot has not said, but for what the push has told the program, so that a node whose own
+/// name is another each time, say, has one.
+fn told(recorded: &Recorded, node: &Node) -> Naming {
+    if !node.named_by_argv {
+        return Naming::default();
+    }
+    let planned = running(recorded, &node.executable);
+    let said = planned.map(|planned| recorded.flavour.says_to_all(&planned.argv));
+    let nothing = Naming {
+        name: false,
+        namespace: false,
+    };
+    said.fold(nothing, |all, one| Naming {
+        name: all.name || one.name,
+        namespace: all.namespace || one.namespace,
+    })
+}
+
 #[async_trait]
 impl Nodes for LinkedNodes {
     fn service(&self) -> &str {
@@ -131,7 +149,8 @@ impl Nodes for LinkedNodes {
         self.told.observer().fits(node.revision, &node.image)?;
         let program = program(&self.recorded, node)?;
         self.end_planned(&*tenant).await;
-        let identity = self.recorded.flavour.identity(&node.name);
+        let says = told(&self.recorded, node);
+        let identity = self.recorded.flavour.of_a_robot(&node.name, says);
         let mut given = self.recorded.parameters.clone();
         given.extend(self.parameters(node));
         let robots = node.argv.iter();
@@ -312,6 +331,7 @@ mod tests {
             directory: String::new(),
             revision: None,
             image: String::new(),
+            named_by_argv: false,
         };
         program(&recorded(), &node).ok().cloned()
     }
@@ -349,18 +369,56 @@ mod tests {
             };
             let robots = argv.iter().map(|argument| (*argument).to_owned());
             let given = flavour.arguments("/camera/see", &given);
-            let identity = flavour.identity("/camera/see");
+            let identity = flavour.of_a_robot("/camera/see", Naming::default());
             command_line("/opt/see", robots, given, &identity).join(" ")
         };
         let robots = ["plain", "--ros-args", "-p", "gain:=1", "-r", "scan:=/front"];
         assert_eq!(
             started(Version::Ros2, &robots),
-            "/opt/see plain --ros-args -p gain:=1 -r scan:=/front --ros-args -p gain:=2 -- --ros-args -r __node:=see -r __ns:=/camera"
+            "/opt/see plain --ros-args -p gain:=1 -r scan:=/front --ros-args -p gain:=2 -- --ros-args -r __node:=see -r __ns:=/camera --enclave /cloudroid_link/camera/see"
         );
         // Those of ROS 1 are on the parameter server.
         assert_eq!(
             started(Version::Ros1, &["_gain:=1", "scan:=/front"]),
             "/opt/see _gain:=1 scan:=/front __name:=see"
         );
+    }
+
+    #[test]
+    fn nodes_keep_the_names_of_their_program_unless_the_robot_or_the_push_says_others() {
+        let mut recorded = recorded();
+        recorded.flavour.ros = Version::Ros2;
+        let planned = |argv: &str| NodeSpec {
+            name: "/front/see".into(),
+            argv: argv.split(' ').map(str::to_owned).collect(),
+            environment: BTreeMap::new(),
+            directory: String::new(),
+            respawn: false,
+            respawn_delay: 0.0,
+            required: false,
+        };
+        let mut said = |argv: &[&str], named_by_argv| {
+            recorded.nodes = argv.iter().map(|argv| planned(argv)).collect();
+            let node = Node {
+                name: "/front/see".into(),
+                executable: "see".into(),
+                named_by_argv,
+                ..Node::default()
+            };
+            let Naming { name, namespace } = told(&recorded, &node);
+            (name, namespace)
+        };
+        let plain = "/opt/mine/lib/vision/see -v";
+        assert_eq!(said(&[plain], true), (false, false));
+        // As earlier stubs mean it.
+        assert_eq!(said(&[plain], false), (true, true));
+        let renamed = format!("{plain} --ros-args -r __node:=see");
+        assert_eq!(said(&[&renamed], true), (true, false));
+        let moved = format!("{plain} --ros-args -r __ns:=/front");
+        assert_eq!(said(&[&moved], true), (false, true));
+        let second = format!("{plain} --ros-args -r see:__node:=see_2");
+        assert_eq!(said(&[plain, &second], true), (false, false));
+        let other = "/opt/mine/lib/vision/look.py --ros-args -r __node:=look";
+        assert_eq!(said(&[plain, other], true), (false, false));
     }
 }

@@ -3,7 +3,7 @@
 //! Messages cross it serialized, reference-counted and never copied per subscriber. What only some ROS versions have is an
 //! extension ([`GlobalParameters`], [`NodeParameters`], [`Lending`], [`Hearing`]) that a bus offers, or not.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -27,7 +27,7 @@ mod types;
 
 pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, Outcome};
 pub use error::{BusError, CallFate};
-pub use graph::{ActionNodes, Graph, NodeEnds, ParameterUse, TopicNodes};
+pub use graph::{ActionNodes, Graph, NodeEnds, NodeNames, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, Lent, ServiceProvider};
 pub use matched::{Matched, Offer, Peer, PeerId, Refusal, reaches};
 pub use node_parameters::{
@@ -141,6 +141,8 @@ pub trait Bus: Send + Sync + 'static {
     fn node(&self) -> &str {
         ""
     }
+    /// Whose nodes' the ends of this side are told to be, where it stands for several (ROS 2); what is not named here is its own node's.
+    fn stands_for(&self, _nodes: BTreeMap<String, NodeNames>) {}
     /// The graph now and as it changes.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Subscribes to messages of type `of` ([`WireType::any`] where it does not matter); publishers that come later are

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::bus::{ParamValue, RosVersion};
-pub use crate::identity::{Called, Identity};
+pub use crate::identity::{Called, Identity, Naming};
 use crate::{ros1, ros2};
 
 /// The base that an image is built upon, and its ROS.
@@ -74,6 +74,23 @@ impl Flavour {
         match self.ros {
             Version::Ros1 => ros1::process::identity(node),
             Version::Ros2 => ros2::process::identity(node),
+        }
+    }
+
+    /// What makes a program a robot's node of this absolute name. In ROS 2 it may be several nodes, and `says` how much of the name they are told:
+    /// what is told is told to all.
+    pub fn of_a_robot(&self, node: &str, says: Naming) -> Identity {
+        match self.ros {
+            Version::Ros1 => ros1::process::identity(node),
+            Version::Ros2 => ros2::process::of_a_robot(node, says),
+        }
+    }
+
+    /// What of its nodes' names a command line says to all of them, whatever their programs call them.
+    pub fn says_to_all(&self, argv: &[String]) -> Naming {
+        match self.ros {
+            Version::Ros1 => Naming::default(),
+            Version::Ros2 => ros2::arguments::says_to_all(argv),
         }
     }
 

@@ -11,6 +11,25 @@ pub struct Identity {
     pub environment: BTreeMap<String, String>,
 }
 
+/// Which parts of a node's name its program is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Naming {
+    /// Its name, without namespace.
+    pub name: bool,
+    /// Its namespace.
+    pub namespace: bool,
+}
+
+/// All of it.
+impl Default for Naming {
+    fn default() -> Self {
+        Self {
+            name: true,
+            namespace: true,
+        }
+    }
+}
+
 /// What a node of a program is called.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Called {

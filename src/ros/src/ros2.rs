@@ -36,3 +36,4 @@ mod type_hash;
 mod watcher;
 
 pub use bus::Ros2Bus;
+pub(crate) use quality::joined;

@@ -399,7 +399,11 @@ impl Runner {
         let expected = self.expected.lock().clone();
         let _ = timeout(SETTLE, self.system.registers(node, &expected)).await;
         let graph = self.system.graph();
-        let listens = |topic: &String| seen::subscribes(&graph, node, topic);
+        let nodes = self.system.nodes_of(&graph, node);
+        let listens = |topic: &String| {
+            let mut nodes = nodes.iter();
+            nodes.any(|node| seen::subscribes(&graph, node, topic))
+        };
         let ends: Vec<_> = {
             let inputs = self.publishers.lock();
             let due = inputs
@@ -412,7 +416,8 @@ impl Runner {
         }
         let sources = self.sources.lock().clone();
         for (topic, source) in sources {
-            if seen::publishes(&graph, node, &topic) {
+            let mut nodes = nodes.iter();
+            if nodes.any(|node| seen::publishes(&graph, node, &topic)) {
                 reaches(source, 1).await;
             }
         }

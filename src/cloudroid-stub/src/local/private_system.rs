@@ -1,12 +1,13 @@
 //! The private ROS system of the local original, of the robot's ROS: a Master of the stub's own, or a domain of its own. Only this
 //! machine can reach it, and the stub's own node there is the only way in or out.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ros::bus::{Bus, Graph, Qos, RosVersion, ServiceType, WireType};
+use ros::bus::{Bus, Graph, NodeNames, Qos, RosVersion, ServiceType, WireType};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -18,13 +19,15 @@ use crate::seen;
 
 /// The stub's name in it.
 pub(super) const NODE: &str = "/cloudroid_stub";
+/// A topic of ROS 2 that every node publishes.
+const EVENTS: &str = "/parameter_events";
 /// For a node whose process has ended to be gone from the graph.
 const GONE: Duration = Duration::from_secs(5);
 
 /// A topic of a node, with its quality of service where ends tell that (ROS 2).
 pub type RegisteredTopic = (String, WireType, Option<Qos>);
 
-/// What a node has registered.
+/// What a process has registered.
 #[derive(Debug, Clone, Default)]
 pub struct Registered {
     /// What it publishes.
@@ -33,6 +36,8 @@ pub struct Registered {
     pub inputs: Vec<RegisteredTopic>,
     /// What it serves.
     pub services: Vec<(String, ServiceType)>,
+    /// Which of all this is whose, where it is several nodes (ROS 2).
+    pub nodes: BTreeMap<String, NodeNames>,
 }
 
 /// Variables of a process, each with its value, or none where it is to be unset.
@@ -149,12 +154,26 @@ impl PrivateSystem {
         self.until(|graph| seen::is_there(graph, node)).await;
     }
 
-    /// Returns once `node` has registered all of this.
+    /// The nodes that the process of `node` has become, which in ROS 2 may be several: nobody else is here.
+    pub fn nodes_of(&self, graph: &Graph, node: &str) -> BTreeSet<String> {
+        let mut nodes = BTreeSet::from([node.to_owned()]);
+        if self.bus.version() == RosVersion::Two {
+            let others = graph.ends.keys().filter(|other| *other != NODE);
+            nodes.extend(others.cloned());
+        }
+        nodes
+    }
+
+    /// Returns once the process of `node` has registered all of this.
     pub async fn registers(&self, node: &str, all: &Interface) {
         self.until(|graph| {
-            let listens = |topic: &String| seen::subscribes(graph, node, topic);
-            let says = |topic: &String| seen::publishes(graph, node, topic);
-            let serves = |service: &String| seen::serves(graph, node, service);
+            let nodes = self.nodes_of(graph, node);
+            let any = |has: fn(&Graph, &str, &str) -> bool, name: &str| {
+                nodes.iter().any(|node| has(graph, node, name))
+            };
+            let listens = |topic: &String| any(seen::subscribes, topic);
+            let says = |topic: &String| any(seen::publishes, topic);
+            let serves = |service: &String| any(seen::serves, service);
             all.inputs.keys().all(listens)
                 && all.outputs.iter().all(says)
                 && all.services.iter().all(serves)
@@ -162,11 +181,11 @@ impl PrivateSystem {
         .await;
     }
 
-    /// What `node` has registered, as far as its types can be told.
+    /// What the process of `node` has registered, as far as its types can be told.
     pub async fn registered_by(&self, node: &str) -> Registered {
         let graph = self.graph();
         if self.bus.version() == RosVersion::Two {
-            return by_ends(&graph, node);
+            return by_ends(&graph, &self.nodes_of(&graph, node));
         }
         let mut registered = Registered::default();
         for topic in graph.topics.keys() {
@@ -212,11 +231,15 @@ impl PrivateSystem {
     }
 }
 
-/// What the ends of a node of ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
-fn by_ends(graph: &Graph, node: &str) -> Registered {
-    let Some(ends) = graph.ends.get(node) else {
-        return Registered::default();
-    };
+/// What the ends of a process of ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
+fn by_ends(graph: &Graph, nodes: &BTreeSet<String>) -> Registered {
+    let ends = graph.ends_of(nodes);
+    let names = nodes.iter().filter_map(|node| {
+        let mut names = graph.ends.get(node)?.names();
+        names.subscribes.remove(EVENTS);
+        Some((node.clone(), names))
+    });
+    let names: BTreeMap<String, NodeNames> = names.collect();
     let topic =
         |(topic, (of, qos)): (&String, &(WireType, Qos))| (topic.clone(), of.clone(), Some(*qos));
     let inputs = ends.subscribers.iter();
@@ -224,11 +247,15 @@ fn by_ends(graph: &Graph, node: &str) -> Registered {
     Registered {
         outputs: ends.publishers.iter().map(topic).collect(),
         inputs: inputs
-            .filter(|(topic, _)| *topic != "/parameter_events")
+            .filter(|(topic, _)| *topic != EVENTS)
             .map(topic)
             .collect(),
         services: services
             .map(|(service, of)| (service.clone(), of.clone()))
             .collect(),
+        nodes: match names.len() {
+            0 | 1 => BTreeMap::new(),
+            _ => names,
+        },
     }
 }

@@ -63,8 +63,10 @@ impl Mirror {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),
             services: registered.services.into_iter().map(serves).collect(),
-            siblings: Vec::new(),
+            ..Graph::default()
         };
+        applied.nodes = registered.nodes;
+        self.bus.stands_for(applied.nodes.clone());
         // What it says has somewhere to go before it is heard, and what it is given comes once it listens.
         self.outputs.apply(self, &graph.outputs, true).await;
         self.learn(&graph).await;

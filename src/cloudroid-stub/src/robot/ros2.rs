@@ -8,7 +8,7 @@ use ros::bus::{ParamValue, RosVersion};
 use ros::ros2::arguments::{self, BEGIN, END, Kind, Part, Renamed, Rule};
 use ros::ros2::{names, process};
 
-use super::{Place, Robot};
+use super::{Place, Robot, Usual};
 use crate::network::{self, Variable};
 use crate::params_file::{Sections, value};
 
@@ -19,18 +19,23 @@ const ALL: &str = "/**";
 /// A file of this robot, by which rcl's logging is set.
 const LOG_CONFIG_FILE: &str = "--log-config-file";
 
-/// As [`Robot::read`]. `usual` has a namespace (`/camera/detector`) where the program gives its node one.
-pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<Robot> {
+/// As [`Robot::read`]. The usual name has a namespace (`/camera/detector`) where the program gives its node one. Of a program of several nodes
+/// it is that of the first.
+pub async fn read(
+    argv: &[String],
+    usual: Usual<'_>,
+    variable: Variable<'_>,
+) -> anyhow::Result<Robot> {
     let parts = arguments::parse(argv)?;
-    let (above, usual) = usual.rsplit_once('/').unwrap_or(("", usual));
-    let (name, node) = named(&parts, above, usual)?;
+    let (above, name) = usual.name.rsplit_once('/').unwrap_or(("", usual.name));
+    let node = named(&parts, above, name)?;
     let sections = sections(&parts)?;
     let parameters = sections.of(&node);
     let (id, network) = network::network(variable).await?;
     Ok(Robot {
         ros: RosVersion::Two,
         place: Place::Domain { id, network },
-        argv: for_the_cloud(&parts, [usual, &name], &parameters),
+        argv: for_the_cloud(&parts, &node, !usual.by_program, &parameters),
         original_argv: for_the_original(parts),
         sim_time: parameters.get("use_sim_time") == Some(&ParamValue::Bool(true)),
         node,
@@ -38,8 +43,8 @@ pub async fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyho
     })
 }
 
-/// The node's name, and with its namespace. Of several rules the first one counts; what the program says, where there is none.
-fn named(parts: &[Part], above: &str, usual: &str) -> anyhow::Result<(String, String)> {
+/// The node's name with its namespace. Of several rules the first one counts; what the program says, where there is none.
+fn named(parts: &[Part], above: &str, usual: &str) -> anyhow::Result<String> {
     let of = |renamed: Renamed, node: &str| {
         let rules = parts.iter().filter_map(rule);
         let mut rules = rules.filter(|rule| rule.of == renamed && rule.concerns(node));
@@ -54,7 +59,7 @@ fn named(parts: &[Part], above: &str, usual: &str) -> anyhow::Result<(String, St
             "{node:?} is not a name that ROS 2 allows for a node; set nodes = {{ \"EXECUTABLE\" = \"NAME\" }} (or \"/NAMESPACE/NAME\") in stub.toml, or give --ros-args -r __node:=NAME"
         );
     }
-    Ok((name, node))
+    Ok(node)
 }
 
 fn rule(part: &Part) -> Option<&Rule> {
@@ -85,34 +90,39 @@ fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
     Ok(sections)
 }
 
-/// The program's own arguments, and then one group of ROS's. The node's name and namespace are given by whoever starts it there.
+/// The program's own arguments, and then one group of ROS's. `told`: all of its nodes are called as `node` that no rule names, since it is not known what
+/// the program calls them.
 fn for_the_cloud(
     parts: &[Part],
-    names: [&str; 2],
+    node: &str,
+    told: bool,
     parameters: &BTreeMap<String, ParamValue>,
 ) -> Vec<String> {
     let mut own = Vec::new();
     let mut given = Vec::new();
+    let mut others = Vec::new();
     let mut is_for_ros = false;
     for part in parts {
         match &part.kind {
             Kind::Own => own.extend(part.words.clone()),
             Kind::Mark => is_for_ros = part.words == [BEGIN],
-            Kind::Rule(rule) => {
-                let names_it = !rule.of.is_name() && names.iter().any(|name| rule.concerns(name));
-                match names_it {
-                    true => {}
-                    false if is_for_ros => given.extend(part.words.clone()),
-                    false => own.extend(part.words.clone()),
-                }
-            }
+            Kind::Rule(_) if is_for_ros => given.extend(part.words.clone()),
+            Kind::Rule(_) => own.extend(part.words.clone()),
             Kind::Setting if part.words[0] == LOG_CONFIG_FILE => tracing::warn!(
                 "{LOG_CONFIG_FILE} {} is a file of this robot: the node in the cloud logs as it does without it",
                 part.words[1]
             ),
             Kind::Setting => given.extend(part.words.clone()),
+            // A program may be several nodes.
+            Kind::Parameter(of) if of.is_of_another(node) => others.extend(part.words.clone()),
             // Below, with those of files.
             Kind::Parameter(_) | Kind::File(_) => {}
+        }
+    }
+    if let Some((above, name)) = node.rsplit_once('/').filter(|_| told) {
+        let above = if above.is_empty() { "/" } else { above };
+        for rule in [format!("__node:={name}"), format!("__ns:={above}")] {
+            given.extend(["-r".to_owned(), rule]);
         }
     }
     for (name, value) in parameters {
@@ -128,6 +138,8 @@ fn for_the_cloud(
         given.push("-p".to_owned());
         given.push(format!("{name}:={}", process::yaml(value)));
     }
+    // Of several for one node the later ones count.
+    given.extend(others);
     if !given.is_empty() {
         own.push(BEGIN.to_owned());
         own.extend(given);
@@ -160,6 +172,10 @@ mod tests {
             // ROS 1's.
             "ROS_NAMESPACE" => Some("/ignored".to_owned()),
             _ => None,
+        };
+        let usual = Usual {
+            name: usual,
+            by_program: true,
         };
         super::read(&argv, usual, &variable).await
     }
@@ -200,13 +216,48 @@ mod tests {
         ] {
             let robot = read_of("/camera/usual", line).await.expect(line);
             assert_eq!(robot.node, node, "{line}");
-            let expected = match line.contains("other") {
-                true => line.split(' ').chain(["--"]).collect(),
-                false => Vec::new(),
+            // The program may be several nodes, of which each takes the rules that concern it.
+            let expected = match line {
+                "" => Vec::new(),
+                line => line.split(' ').chain(["--"]).collect(),
             };
             assert_eq!(robot.argv, expected, "{line}");
         }
         assert!(read_of("camera/usual", "").await.is_err());
+    }
+
+    #[tokio::test]
+    async fn a_program_is_told_a_name_that_it_is_not_known_to_say() {
+        for (line, argv) in [
+            ("", "--ros-args -r __node:=guess -r __ns:=/ --"),
+            (
+                "--ros-args -r __ns:=/front",
+                "--ros-args -r __ns:=/front -r __node:=guess -r __ns:=/front --",
+            ),
+            (
+                "__node:=a",
+                "__node:=a --ros-args -r __node:=a -r __ns:=/ --",
+            ),
+        ] {
+            let words: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
+            let usual = Usual {
+                name: "guess",
+                by_program: false,
+            };
+            let robot = super::read(&words, usual, &|_| None).await.expect(line);
+            assert_eq!(robot.argv.join(" "), argv, "{line}");
+        }
+    }
+
+    #[tokio::test]
+    async fn further_nodes_of_the_program_have_their_own_parameters() {
+        let line = "--ros-args -p tenor:high:=true -p rate:=1 -p alto:rate:=2 --param tenor:cloudroid.max:=0.5";
+        let robot = read_of("alto", line).await.expect("a robot");
+        // That of the first one, which has to be all's, does not count for one that has its own.
+        let expected =
+            "--ros-args -p rate:=2 -p tenor:high:=true --param tenor:cloudroid.max:=0.5 --";
+        assert_eq!(robot.argv.join(" "), expected);
+        assert!(robot.settings().is_empty());
     }
 
     #[tokio::test]
@@ -239,6 +290,10 @@ people:
             "own",
             "--ros-args",
             "-r",
+            "__node:=people",
+            "-r",
+            "__ns:=/front",
+            "-r",
             "image:=/camera/image",
             "--log-level",
             "debug",
@@ -248,6 +303,8 @@ people:
             "rate:=3",
             "-p",
             "use_sim_time:=true",
+            "-p",
+            "other:rate:=9",
             "--",
         ];
         assert_eq!(robot.argv, expected);
@@ -289,7 +346,11 @@ people:
             assert!(error.contains(said), "{line}: {error}");
         }
         let argv = ["--ros-args".to_owned()];
-        let error = super::read(&argv, "9", &|_| None)
+        let usual = Usual {
+            name: "9",
+            by_program: false,
+        };
+        let error = super::read(&argv, usual, &|_| None)
             .await
             .expect_err("no name");
         assert!(

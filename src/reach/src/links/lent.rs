@@ -340,11 +340,22 @@ pub(super) async fn begin(hub: &Arc<Hub>) {
 impl Hub {
     /// The link by which a node's lookups and calls go: its own, else one that is up, since all are on one robot.
     fn way(&self, node: &str, suits: impl Fn(&NodeLink) -> bool) -> Option<Arc<NodeLink>> {
+        let graph = self.bus.graph().borrow().clone();
         let links = self.links.lock();
         let suitable = || links.values().filter(|link| suits(link));
-        let own = suitable().find(|link| link.node == node);
+        let own = suitable().find(|link| graph.is_of_process(&link.node, node));
         let up = || suitable().find(|link| link.session.is_up());
         own.or_else(up).or_else(|| suitable().next()).cloned()
+    }
+
+    /// The link of the process that a node is of.
+    fn link_of(&self, node: &str) -> Option<Arc<NodeLink>> {
+        let graph = self.bus.graph().borrow().clone();
+        let links = self.links.lock();
+        let mut links = links.values();
+        links
+            .find(|link| graph.is_of_process(&link.node, node))
+            .cloned()
     }
 }
 
@@ -395,7 +406,7 @@ impl ServiceHandler for Passing {
             ));
         }
         // Whichever way it goes, its stamps are those of the node that calls.
-        let calling = hub.links.lock().get(caller).cloned();
+        let calling = hub.link_of(caller);
         let calling = calling.unwrap_or_else(|| Arc::clone(&link));
         let request = calling.shift(&hub, Direction::Out, &there.request, request);
         let response = link.call_robot(there.channel, request).await?;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ros::bus::{Digest, ServiceType, WireType};
 
 use super::node_link::{NodeLink, Service};
-use super::seen::{Declared, Seen};
+use super::seen::{self, Declared, Seen};
 use super::{Hub, types};
 use link::control::{FromCloud, Graph, Output, Served, Wanted};
 use ros::codec::Stamps;
@@ -47,7 +47,8 @@ impl Sent {
             hub.changed();
         }
         let mut graph = Graph {
-            siblings: hub.siblings(&link.node),
+            siblings: hub.siblings(&graph, &link.node),
+            nodes: seen::owners(&graph, &link.node),
             ..Graph::default()
         };
         for (topic, declared) in &seen.outputs {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Matched, PeerId, Qos, WireType, reaches};
+use ros::bus::{Bus, Graph, Matched, PeerId, Qos, WireType, reaches};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
@@ -161,9 +161,9 @@ impl Outputs {
             };
             let read = async {
                 while let Some(message) = subscription.messages.recv().await {
+                    let Some(hub) = hub.upgrade() else { break };
                     // Other nodes of the servant have links of their own.
-                    if message.publisher.node() == reader.node {
-                        let Some(hub) = hub.upgrade() else { break };
+                    if hub.is_of(&reader, message.publisher.node()) {
                         let bytes = reader.shift(&hub, Direction::Out, &stamps, message.bytes);
                         reader.send(channel, bytes, message.latching);
                     }
@@ -188,9 +188,11 @@ async fn heard(
     before: BTreeSet<PeerId>,
 ) {
     let Some(hearing) = bus.hearing() else {
-        // Both know of each other then; another node may publish the same topic.
+        // Both know of each other then; nodes of other processes may publish the same topic.
         let mut publishers = publishers;
-        let _ = publishers.wait_for(|now| now.has_node(node)).await;
+        let nodes = publishing(&bus.graph().borrow(), node, topic);
+        let all = |now: &Matched| nodes.iter().all(|node| now.has_node(node));
+        let _ = publishers.wait_for(all).await;
         return;
     };
     reaches(publishers, 1).await;
@@ -204,6 +206,24 @@ async fn heard(
         }
         tokio::time::sleep(pause).await;
         pause = (pause * 2).min(LONGEST_LOOK);
+    }
+}
+
+/// The nodes of a process that publish the topic.
+fn publishing(graph: &Graph, node: &str, topic: &str) -> BTreeSet<String> {
+    let mut nodes = graph.of_process(node);
+    nodes.retain(|node| graph.publishes(node, topic));
+    if nodes.is_empty() {
+        nodes.insert(node.to_owned());
+    }
+    nodes
+}
+
+impl Hub {
+    /// Whether a node is one of the link's process.
+    fn is_of(&self, link: &NodeLink, node: &str) -> bool {
+        let graph = || self.bus.graph();
+        node == link.node || graph().borrow().is_of_process(&link.node, node)
     }
 }
 

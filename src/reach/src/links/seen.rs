@@ -4,6 +4,7 @@
 
 use std::collections::BTreeMap;
 
+use link::control::Has;
 use ros::bus::{Graph, Qos, RosVersion, ServiceType, WireType};
 
 /// A node hears only its own changes by this topic of ROS 2, which every node publishes.
@@ -40,7 +41,7 @@ impl Declared {
 }
 
 impl Seen {
-    /// What the node of this name has.
+    /// What the node of this name has; in ROS 2 all nodes of its process.
     pub(super) fn of(graph: &Graph, node: &str, version: RosVersion) -> Self {
         match version {
             RosVersion::One => Self::of_one(graph, node),
@@ -66,9 +67,7 @@ impl Seen {
     }
 
     fn of_two(graph: &Graph, node: &str) -> Self {
-        let Some(ends) = graph.ends.get(node) else {
-            return Self::default();
-        };
+        let ends = graph.ends_of(&graph.of_process(node));
         let declared = |topics: &BTreeMap<String, (WireType, Qos)>| {
             let topics = topics.iter();
             topics
@@ -88,9 +87,25 @@ impl Seen {
     }
 }
 
-/// Services and actions that the node looks for and nobody in the servant has.
+/// Which of what a process has is whose, where it is not all the node's of this name.
+pub(super) fn owners(graph: &Graph, node: &str) -> BTreeMap<String, Has> {
+    let nodes = graph.of_process(node);
+    if nodes.len() < 2 {
+        return BTreeMap::new();
+    }
+    let there = nodes.into_iter();
+    let has = there.filter_map(|node| {
+        let mut names = graph.ends.get(&node)?.names();
+        names.subscribes.remove(OWN_EVENTS);
+        Some((node, names.into()))
+    });
+    has.collect()
+}
+
+/// Services and actions that the node's process looks for and nobody in the servant has.
 pub(super) fn sought(graph: &Graph, node: &str) -> Vec<String> {
-    let is_it = |other: &String| other == node;
+    let nodes = graph.of_process(node);
+    let is_it = |other: &String| nodes.contains(other);
     let services = graph.sought.iter();
     let services = services
         .filter(|(service, nodes)| {
@@ -175,6 +190,59 @@ mod tests {
         let told = seen.outputs["/map"].qos().expect("it is told");
         assert!(told.transient_local && !told.best_effort);
         assert_eq!(seen.services["/fib/_action/get_result"], Some(get_result));
+    }
+
+    #[test]
+    fn a_process_of_ros_2_has_what_its_nodes_have_and_it_is_said_whose_it_is() {
+        let of = || WireType::named("std_msgs/msg/String").written_by(RosVersion::Two);
+        let topics = |names: &[&str]| {
+            let topic = |name: &&str| ((*name).to_owned(), (of(), Qos::keep_last(1)));
+            names.iter().map(topic).collect()
+        };
+        let node = |publishes: &[&str], subscribes: &[&str]| NodeEnds {
+            publishers: topics(publishes),
+            subscribers: topics(subscribes),
+            ..NodeEnds::default()
+        };
+        let nodes = || ["/see".to_owned(), "/tell".to_owned()];
+        let graph = |process: &[String]| Graph {
+            ends: [
+                ("/see".to_owned(), node(&["/found"], &["/image"])),
+                (
+                    "/tell".to_owned(),
+                    node(&["/said", "/found"], &[OWN_EVENTS]),
+                ),
+                ("/other".to_owned(), node(&["/others"], &[])),
+            ]
+            .into(),
+            sought: [("/map".to_owned(), vec!["/tell".to_owned()])].into(),
+            enclaves: [(
+                "/cloudroid_link/see".to_owned(),
+                process.iter().cloned().collect(),
+            )]
+            .into(),
+            ..Graph::default()
+        };
+        let one = graph(&nodes()[..1]);
+        assert!(owners(&one, "/see").is_empty() && sought(&one, "/see").is_empty());
+        let two = graph(&nodes());
+        let seen = Seen::of(&two, "/see", RosVersion::Two);
+        let outputs: Vec<_> = seen.outputs.keys().collect();
+        assert_eq!(outputs, ["/found", "/said"]);
+        assert_eq!(seen.inputs.keys().collect::<Vec<_>>(), ["/image"]);
+        assert_eq!(sought(&two, "/see"), ["/map"]);
+        let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
+        let see = Has {
+            outputs: names(&["/found"]),
+            inputs: names(&["/image"]),
+            ..Has::default()
+        };
+        let tell = Has {
+            outputs: names(&["/found", "/said"]),
+            ..Has::default()
+        };
+        let [one, other] = nodes();
+        assert_eq!(owners(&two, "/see"), [(one, see), (other, tell)].into());
     }
 
     #[test]

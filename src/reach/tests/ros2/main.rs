@@ -10,6 +10,7 @@ mod network;
 mod network_pictures;
 mod parameters;
 mod pictures;
+mod processes;
 mod robot;
 mod rosbridge;
 mod servers;

@@ -62,6 +62,33 @@ impl Graph {
         shown.is_some_and(|ends| !ends.servers.is_empty())
             || self.serves(&crate::ros2::names::part_of_action(action, "send_goal"))
     }
+
+    /// The nodes of the process that a servant runs as a robot's node of this name: that one, and in ROS 2 all that are in the enclave by
+    /// which the process is marked.
+    pub fn of_process(&self, node: &str) -> BTreeSet<String> {
+        let mark = crate::ros2::process::enclave_of(node);
+        let marked = mark.and_then(|mark| self.enclaves.get(&mark));
+        let marked = marked.into_iter().flatten().cloned();
+        marked.chain([node.to_owned()]).collect()
+    }
+
+    /// Whether a node is one of that process.
+    pub fn is_of_process(&self, node: &str, other: &str) -> bool {
+        let marked = || {
+            let mark = crate::ros2::process::enclave_of(node)?;
+            self.enclaves.get(&mark)
+        };
+        node == other || marked().is_some_and(|nodes| nodes.contains(other))
+    }
+
+    /// What these nodes have, as if they were one.
+    pub fn ends_of(&self, nodes: &BTreeSet<String>) -> NodeEnds {
+        let mut all = NodeEnds::default();
+        for ends in nodes.iter().filter_map(|node| self.ends.get(node)) {
+            all.join(ends);
+        }
+        all
+    }
 }
 
 /// All that one node has, as its ends tell it: by name, with types that have no definition.
@@ -75,6 +102,54 @@ pub struct NodeEnds {
     pub services: BTreeMap<String, ServiceType>,
     /// Services that it may call.
     pub clients: BTreeMap<String, ServiceType>,
+}
+
+impl NodeEnds {
+    /// With those of another; of several types of one name the first stays.
+    fn join(&mut self, other: &NodeEnds) {
+        let sides = [
+            (&mut self.publishers, &other.publishers, true),
+            (&mut self.subscribers, &other.subscribers, false),
+        ];
+        for (topics, others, publishes) in sides {
+            for (topic, (of, qos)) in others {
+                let known = topics.entry(topic.clone());
+                let known = known.or_insert_with(|| (of.clone(), *qos));
+                known.1 = crate::ros2::joined(known.1, *qos, publishes);
+            }
+        }
+        let sides = [
+            (&mut self.services, &other.services),
+            (&mut self.clients, &other.clients),
+        ];
+        for (services, others) in sides {
+            for (service, of) in others {
+                services
+                    .entry(service.clone())
+                    .or_insert_with(|| of.clone());
+            }
+        }
+    }
+
+    /// By name.
+    pub fn names(&self) -> NodeNames {
+        NodeNames {
+            publishes: self.publishers.keys().cloned().collect(),
+            subscribes: self.subscribers.keys().cloned().collect(),
+            serves: self.services.keys().cloned().collect(),
+        }
+    }
+}
+
+/// What a node has, by name.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct NodeNames {
+    /// Topics.
+    pub publishes: BTreeSet<String>,
+    /// Topics.
+    pub subscribes: BTreeSet<String>,
+    /// Services.
+    pub serves: BTreeSet<String>,
 }
 
 /// The ends of one topic.
@@ -108,4 +183,57 @@ pub struct ParameterUse {
     pub read_by: Vec<String>,
     /// Nodes that set it.
     pub written_by: Vec<String>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::Reliability;
+
+    #[test]
+    fn nodes_of_one_process_are_known_by_its_enclave_and_seen_as_one() {
+        let weak = Qos {
+            reliability: Reliability::BestEffort,
+            ..Qos::keep_last(5)
+        };
+        let topic = |name: &str, qos| (name.to_owned(), (WireType::any(), qos));
+        let set = ServiceType::new("std_srvs/srv/SetBool", "*");
+        let ears = NodeEnds {
+            publishers: [topic("/log", weak)].into(),
+            subscribers: [topic("/scan", Qos::keep_last(1))].into(),
+            ..NodeEnds::default()
+        };
+        let mouth = NodeEnds {
+            publishers: [topic("/log", Qos::keep_last(9).latching(true))].into(),
+            subscribers: [topic("/scan", weak)].into(),
+            services: [("/mouth/set".to_owned(), set.clone())].into(),
+            ..NodeEnds::default()
+        };
+        let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
+        let mark = crate::ros2::process::enclave_of("/ears").expect("a mark");
+        let graph = Graph {
+            enclaves: [(mark, named(&["/ears", "/mouth"]))].into(),
+            ends: [
+                ("/ears".to_owned(), ears),
+                ("/mouth".to_owned(), mouth.clone()),
+                ("/nose".to_owned(), mouth),
+            ]
+            .into(),
+            ..Graph::default()
+        };
+        let nodes: BTreeSet<String> = graph.of_process("/ears");
+        assert_eq!(nodes, named(&["/ears", "/mouth"]));
+        assert_eq!(graph.of_process("/nose"), named(&["/nose"]));
+        assert!(graph.is_of_process("/ears", "/mouth"));
+        assert!(!graph.is_of_process("/ears", "/nose") && !graph.is_of_process("/mouth", "/ears"));
+        let all = graph.ends_of(&nodes);
+        // The most that is offered, and the least that is asked for.
+        let log = all.publishers["/log"].1;
+        assert!(log.is_latching() && log.reliability == Reliability::Reliable);
+        assert_eq!(
+            all.subscribers["/scan"].1.reliability,
+            Reliability::BestEffort
+        );
+        assert_eq!(all.services, [("/mouth/set".to_owned(), set)].into());
+    }
 }

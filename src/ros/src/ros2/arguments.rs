@@ -6,6 +6,7 @@
 //! ```
 
 use super::names;
+use crate::identity::Naming;
 
 /// What follows is for ROS, up to the end or to [`END`].
 pub const BEGIN: &str = "--ros-args";
@@ -100,6 +101,14 @@ pub struct Parameter {
     pub name: String,
     /// Its value, as written: YAML.
     pub value: String,
+}
+
+impl Parameter {
+    /// Whether it holds for another node than that of this absolute name. A command line names nodes without a namespace alone.
+    pub fn is_of_another(&self, node: &str) -> bool {
+        let of = self.node.as_deref();
+        of.is_some_and(|of| node.strip_prefix('/') != Some(of))
+    }
 }
 
 /// An argument that rcl would not take either.
@@ -199,9 +208,27 @@ pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
 
 /// Whether a command line says in which namespace its nodes are; else their program may.
 pub fn gives_namespace(argv: &[String]) -> bool {
+    renames(argv, |rule| rule.of == Renamed::Namespace)
+}
+
+/// Whether a command line says what some of its nodes are called; else their program does.
+pub fn gives_name(argv: &[String]) -> bool {
+    renames(argv, |rule| rule.of == Renamed::Node)
+}
+
+fn renames(argv: &[String], is_meant: impl Fn(&Rule) -> bool) -> bool {
     let parts = parse(argv).unwrap_or_default();
     let mut kinds = parts.iter().map(|part| &part.kind);
-    kinds.any(|kind| matches!(kind, Kind::Rule(rule) if rule.of == Renamed::Namespace))
+    kinds.any(|kind| matches!(kind, Kind::Rule(rule) if is_meant(rule)))
+}
+
+/// What of its nodes' names a command line says to all of them, by rules that are not for one alone.
+pub fn says_to_all(argv: &[String]) -> Naming {
+    let says = |renamed: Renamed| renames(argv, |rule| rule.of == renamed && rule.node.is_none());
+    Naming {
+        name: says(Renamed::Node),
+        namespace: says(Renamed::Namespace),
+    }
 }
 
 fn value_of<'a>(

@@ -17,7 +17,7 @@
 //! Actions are made of the same: `calls::client` and `services::serve` with names below `/_action/`, and `raw`, whose ends hear
 //! each other, because an action's client may have its server behind the same bus.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::future::Future;
 use std::io;
@@ -49,7 +49,7 @@ use super::watcher::Watcher;
 use super::{actions, calls, names, publications, services, subscriptions, topic_type};
 use crate::JoinOptions;
 use crate::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending, NodeNames,
     NodeParameters, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
     WireFormat, WireType,
 };
@@ -277,6 +277,10 @@ impl Bus for Ros2Bus {
 
     fn node(&self) -> &str {
         &self.inner.node
+    }
+
+    fn stands_for(&self, nodes: BTreeMap<String, NodeNames>) {
+        self.inner.own.stand_for(nodes);
     }
 
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {

@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::bus::ParamValue;
-use crate::identity::{Called, Identity};
+use crate::identity::{Called, Identity, Naming};
 
 /// The domain of every servant's nodes, and of the bus that speaks with them. A servant's network is its own, so that all can
 /// have the same.
@@ -16,6 +16,11 @@ pub(crate) const HOME: &str = "ROS_HOME";
 /// What follows on a command line is for ROS, up to its end or to [`END`].
 const ROS_ARGUMENTS: &str = "--ros-args";
 const END: &str = "--";
+
+/// Before the name of a robot's node, in the enclave of its process.
+const LINKED: &str = "/cloudroid_link";
+/// The longest name of a node that is marked by its enclave.
+const MAX_MARKED: usize = 200;
 
 pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
     [
@@ -34,6 +39,30 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
 pub(crate) fn identity(node: &str) -> Identity {
     let (above, last) = halves(node);
     remapped(&[("__node", last), ("__ns", or_root(above))])
+}
+
+/// What a program is told that runs as a robot's node of this name: as much of the name as its command line does not say itself, and the
+/// mark by which its nodes are known.
+pub(crate) fn of_a_robot(node: &str, says: Naming) -> Identity {
+    let (above, last) = halves(node);
+    let name = says
+        .name
+        .then(|| ["-r".to_owned(), format!("__node:={last}")]);
+    let namespace = says
+        .namespace
+        .then(|| ["-r".to_owned(), format!("__ns:={}", or_root(above))]);
+    let mark = enclave_of(node).map(|mark| ["--enclave".to_owned(), mark]);
+    let told = [name, namespace, mark].into_iter().flatten();
+    Identity {
+        arguments: ros_arguments(told),
+        environment: BTreeMap::new(),
+    }
+}
+
+/// The enclave of a process that runs as a robot's node of this name, by which all of its nodes are known, whatever their names. None for a name that
+/// would make it longer than rcl allows.
+pub(crate) fn enclave_of(node: &str) -> Option<String> {
+    (node.len() <= MAX_MARKED).then(|| format!("{LINKED}{node}"))
 }
 
 /// Rules for each node of a process that is called otherwise than by its program. A program that says another name each time is told by rules for all
@@ -214,6 +243,25 @@ mod tests {
         let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
         assert_eq!(first_rule(&argv("/x -v --ros-args -r __ns:=/front")), 2);
         assert_eq!(first_rule(&argv("/x -v")), 2);
+    }
+
+    #[test]
+    fn a_robots_program_is_told_what_its_command_line_does_not_say_and_is_marked() {
+        let told = |name, namespace| {
+            let says = Naming { name, namespace };
+            of_a_robot("/camera/see", says).arguments.join(" ")
+        };
+        let mark = "--enclave /cloudroid_link/camera/see";
+        assert_eq!(told(false, false), format!("--ros-args {mark}"));
+        assert_eq!(
+            told(false, true),
+            format!("--ros-args -r __ns:=/camera {mark}")
+        );
+        let all = format!("--ros-args -r __node:=see -r __ns:=/camera {mark}");
+        assert_eq!(told(true, true), all);
+        let long = format!("/{}", "x".repeat(240));
+        let all = Naming::default();
+        assert_eq!(of_a_robot(&long, all).arguments, identity(&long).arguments);
     }
 
     #[test]

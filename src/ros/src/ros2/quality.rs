@@ -85,8 +85,8 @@ pub(super) fn of_end(qos: &EndpointQos) -> Qos {
     }
 }
 
-/// What two ends of one node on one topic are as one: a publisher offers the most of both, a subscriber asks for the least.
-pub(super) fn joined(one: Qos, two: Qos, publishes: bool) -> Qos {
+/// What two ends on one topic are as one: a publisher offers the most of both, a subscriber asks for the least.
+pub(crate) fn joined(one: Qos, two: Qos, publishes: bool) -> Qos {
     let reliable = [one, two].map(|it| it.reliability == bus::Reliability::Reliable);
     let latching = [one, two].map(|it| it.is_latching());
     let both = |of: [bool; 2]| match publishes {

@@ -21,10 +21,10 @@ const PATIENCE: Duration = Duration::from_millis(500);
 /// Follows one bus's graph.
 pub(super) struct Watcher {
     bus: Arc<Inner>,
-    /// Tells of this node.
+    /// Tells of this node, and of those that it stands for.
     teller: rtps::Writer,
     /// What was told last.
-    told: Option<(Node, GidSize)>,
+    told: Option<(Vec<Node>, GidSize)>,
     /// Ends of nobody yet, and since when.
     unnamed: HashMap<Guid, Instant>,
     /// When the next of them will be late.
@@ -83,7 +83,8 @@ impl Watcher {
         let seen = Arc::new(seen);
         let bus = &self.bus;
         let own = bus.own.ends();
-        self.tell(&own.node(&self.bus.node), seen.gids);
+        let nodes = bus.own.told(&own, &bus.node);
+        self.tell(nodes, seen.gids);
         let bus = &self.bus;
         let mut now = graph::build(&seen, &own, (bus.node.as_str(), bus.participant.guid()));
         bus.seen.send_replace(Arc::clone(&seen));
@@ -119,17 +120,13 @@ impl Watcher {
         self.unnamed = unnamed;
     }
 
-    fn tell(&mut self, node: &Node, size: GidSize) {
-        let news = self
-            .told
-            .as_ref()
-            .is_none_or(|(before, with)| before != node || *with != size);
-        if news {
+    fn tell(&mut self, nodes: Vec<Node>, size: GidSize) {
+        let now = (nodes, size);
+        if self.told.as_ref() != Some(&now) {
             let participant = self.bus.participant.guid();
-            let nodes = std::slice::from_ref(node);
             self.teller
-                .write(entities::encode(participant, nodes, size));
-            self.told = Some((node.clone(), size));
+                .write(entities::encode(participant, &now.0, size));
+            self.told = Some(now);
         }
     }
 }

@@ -119,3 +119,20 @@ fn what_rcl_refuses_is_refused_by_name() {
         assert!(error.contains(said), "{line}: {error}");
     }
 }
+
+#[test]
+fn rules_for_one_node_say_nothing_to_the_others() {
+    for (line, name, namespace) in [
+        ("x --ros-args -r a:=b", false, false),
+        (
+            "--ros-args -r ears:__node:=x -r ears:__ns:=/y",
+            false,
+            false,
+        ),
+        ("--ros-args -r ears:__node:=x -r __ns:=/y", false, true),
+        ("__node:=x", true, false),
+    ] {
+        let argv: Vec<String> = line.split(' ').map(str::to_owned).collect();
+        assert_eq!(says_to_all(&argv), Naming { name, namespace }, "{line}");
+    }
+}

@@ -1,5 +1,5 @@
 use super::*;
-use crate::bus::{BusError, Graph, Qos};
+use crate::bus::{BusError, Graph, NodeNames, Qos};
 use crate::ros2::Ros2Bus;
 use crate::{JoinOptions, net::HostSockets};
 
@@ -40,6 +40,45 @@ async fn nodes_are_shown_with_what_they_have() {
     assert!(after.await.generation > before);
     one.close().await;
     graph(&two, |graph| !graph.nodes.contains_key("/one")).await;
+}
+
+#[tokio::test]
+async fn a_bus_that_stands_for_several_nodes_is_seen_as_these() {
+    let (one, two) = (join(53, "/ears").await, join(53, "/other").await);
+    let qos = Qos::keep_last(1);
+    let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
+    let mouth = NodeNames {
+        publishes: names(&["/said", "/log"]),
+        ..NodeNames::default()
+    };
+    let ears = NodeNames {
+        publishes: names(&["/log"]),
+        ..NodeNames::default()
+    };
+    let both = |mouth: &NodeNames| {
+        [
+            ("/ears".to_owned(), ears.clone()),
+            ("/mouth".to_owned(), mouth.clone()),
+            ("no name".to_owned(), ears.clone()),
+        ]
+    };
+    one.stands_for(both(&mouth).into());
+    let _said = one.advertise("/said", string(), qos).await.unwrap();
+    let _log = one.advertise("/log", string(), qos).await.unwrap();
+    let _heard = one.subscribe("/said", string(), qos).await.unwrap();
+    let is = |graph: &Graph, said: &str| {
+        let said_by = graph.topics.get("/said");
+        said_by.is_some_and(|ends| ends.publishers == [said] && ends.subscribers == ["/ears"])
+            && graph.topics.contains_key("/log")
+    };
+    let seen = graph(&two, |graph| is(graph, "/mouth")).await;
+    let nodes: Vec<_> = seen.nodes.keys().collect();
+    assert_eq!(nodes, ["/ears", "/mouth", "/other"]);
+    assert_eq!(seen.nodes["/mouth"], one.guid().to_string());
+    // It is its own again when nobody else is said to have it.
+    one.stands_for([].into());
+    let seen = graph(&two, |graph| is(graph, "/ears")).await;
+    assert!(!seen.nodes.contains_key("/mouth"), "{seen:#?}");
 }
 
 #[tokio::test]
