@@ -1,6 +1,7 @@
 //! Packages of ROS 2, by rosbridge and by stubs. What a robot sees of a stub when the link is bad is told in [`crate::failover`] and
 //! [`crate::fallback`], for both ROSes.
 
+use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -17,6 +18,7 @@ use ros::bus::{
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
 use support::cable::{Badness, Cable};
+use support::daemon::Daemon;
 use support::layout::Layout;
 use support::people::{self, Camera};
 use support::robot::PATIENCE;
@@ -484,6 +486,15 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
     let first = with_log(site.calls(&app, "/greet", &request), &stub)?;
     ensure!(is_known(&first) == Some(false), "{first:?}");
     let before = app.graph().borrow().ends.get("/herald").cloned();
+    let participants = |daemon: &Daemon| -> anyhow::Result<BTreeSet<String>> {
+        let servant = daemon.servant_of("herald", "ros2-again")?;
+        let id = servant["id"].as_str().context("an id")?;
+        let left = std::fs::read(daemon.home.join(format!("servants/{id}/daemon.json")))?;
+        let left: Value = serde_json::from_slice(&left)?;
+        let participants = left["participants"].as_array().context("a list")?;
+        Ok(participants.iter().map(Value::to_string).collect())
+    };
+    let earlier = participants(&daemon)?;
     daemon.is_killed()?;
     let daemon = setup.listen(&address).start()?;
     // A call made meanwhile is answered, or forgotten, of which DDS has no way to tell its caller; the next one is answered.
@@ -499,6 +510,12 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
         stub.said()
     );
     ensure!(app.graph().borrow().ends.get("/herald").cloned() == before);
+    // The node was told that the participants of the daemon before are gone, and can be told of these.
+    let now = participants(&daemon)?;
+    ensure!(
+        !earlier.is_empty() && earlier.is_subset(&now) && earlier != now,
+        "{earlier:?} {now:?}"
+    );
     drop(stub);
     daemon.deployer().types(&["stop", "--all"])?;
     daemon.ends()?;
