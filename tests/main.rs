@@ -177,6 +177,10 @@ static TELLING: RwLock<()> = RwLock::new(());
 static TOOK: Mutex<Vec<(Duration, &str)>> = Mutex::new(Vec::new());
 /// Of which the longest are printed.
 const LONGEST: usize = 20;
+/// Why stories failed.
+static FAILED: Mutex<Vec<(&str, String)>> = Mutex::new(Vec::new());
+/// Of each reason so many characters are printed, from its beginning.
+const REASON: usize = 2000;
 
 fn told(name: &'static str, tell: impl FnOnce() -> Verdict + Send + 'static) -> Trial {
     Trial::test(name, move || {
@@ -186,7 +190,11 @@ fn told(name: &'static str, tell: impl FnOnce() -> Verdict + Send + 'static) -> 
         let verdict = tell();
         drop((alone, beside));
         TOOK.lock().push((began.elapsed(), name));
-        verdict.map_err(|error| format!("{error:#}").into())
+        verdict.map_err(|error| {
+            let reason = format!("{error:#}");
+            FAILED.lock().push((name, reason.clone()));
+            reason.into()
+        })
     })
 }
 
@@ -196,6 +204,14 @@ fn print_longest() {
     println!("== the longest stories, in seconds");
     for (time, name) in took.iter().take(LONGEST) {
         println!("{:8.1}  {name}", time.as_secs_f64());
+    }
+}
+
+/// Says last which stories failed and why: of a long record the end is what is looked at, or kept.
+fn print_failed() {
+    for (name, reason) in FAILED.lock().iter() {
+        let shown: String = reason.chars().take(REASON).collect();
+        println!("== failed: {name}\n{shown}");
     }
 }
 
@@ -611,6 +627,7 @@ fn main() -> ExitCode {
     let conclusion = libtest_mimic::run(&arguments, trials);
     if !arguments.list {
         print_longest();
+        print_failed();
     }
     let left = support::world::end();
     for thing in &left {

@@ -2,6 +2,7 @@
 
 import array
 import random
+import time
 import zlib
 
 import rclpy
@@ -11,6 +12,13 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String, UInt32
 
 WIDTH, HEIGHT = 1920, 1080
+
+
+def wait_for_subscriber(publisher):
+    """Nodes that know each other's names have not found all of each other's topics yet, on a busy machine least of all."""
+    deadline = time.monotonic() + 60
+    while publisher.get_subscription_count() == 0 and time.monotonic() < deadline:
+        time.sleep(0.01)
 
 
 class Eye(Node):
@@ -25,6 +33,7 @@ class Eye(Node):
         picture.header.stamp.sec = told.data
         picture.header.frame_id = str(zlib.crc32(pixels))
         picture.data = array.array("B", pixels)
+        wait_for_subscriber(self.pictures)
         self.pictures.publish(picture)
 
 
@@ -37,6 +46,7 @@ class Reader(Node):
     def see(self, picture):
         whole = picture.header.frame_id == str(zlib.crc32(picture.data))
         seen = "%d: %d bytes, %s" % (picture.header.stamp.sec, len(picture.data), "whole" if whole else "torn")
+        wait_for_subscriber(self.seen)
         self.seen.publish(String(data=seen))
 
 

@@ -10,6 +10,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from std_msgs.msg import String
 
+from sentry_ros2.pictures import wait_for_subscriber
+
 CLOSED = "/post/closed"
 
 
@@ -37,6 +39,8 @@ class Sentry(LifecycleNode):
 
     def hear(self, noise):
         # Goes nowhere while the node is not active.
+        if self.alarms.is_activated:
+            wait_for_subscriber(self.alarms)
         self.alarms.publish(String(data="%s heard by %s" % (noise.data, socket.gethostname())))
 
 
