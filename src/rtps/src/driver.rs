@@ -4,6 +4,7 @@
 mod tests;
 
 use std::io;
+use std::net::UdpSocket;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,8 +16,8 @@ use rustix::time::{
     timerfd_settime,
 };
 use socket2::SockRef;
-use tokio::io::unix::AsyncFd;
-use tokio::net::UdpSocket;
+use tokio::io::Interest;
+use tokio::io::unix::{AsyncFd, AsyncFdReadyGuard};
 use tokio::sync::Notify;
 
 use crate::engine::{Datagram, Engine};
@@ -31,6 +32,8 @@ const SHORTEST: Duration = Duration::from_micros(10);
 pub(crate) const PORTS: Duration = Duration::from_millis(200);
 /// Datagrams that are taken at once from one socket, before others have their turn.
 const AT_ONCE: usize = 32;
+/// How long until it is tried again to send where it cannot be awaited that there is room.
+const NO_ROOM: Duration = Duration::from_millis(1);
 /// The longest datagram.
 const LONGEST: usize = 65_536;
 /// A shorter datagram is copied out of the buffer, a longer one takes the buffer with it.
@@ -46,19 +49,23 @@ pub(crate) struct Core {
     stalled: Option<Datagram>,
 }
 
+/// A socket of which is told that something has come, and not that it has room: that would wake this process for each datagram that a
+/// receiver takes, just when the receiver answers it.
+type Incoming = AsyncFd<UdpSocket>;
+
 /// What a participant, its ends and its task share.
 pub(crate) struct Shared {
     core: Mutex<Core>,
     wake: Notify,
     /// Where ends are announced.
-    discovery: UdpSocket,
+    discovery: Incoming,
     /// Where samples come in, and all goes out.
-    user: UdpSocket,
+    user: Incoming,
     /// Where participants announce themselves to all.
-    multicast: Option<UdpSocket>,
+    multicast: Option<Incoming>,
 }
 
-/// The sockets of a participant.
+/// The sockets of a participant, which do not block.
 pub(crate) struct Sockets {
     pub discovery: UdpSocket,
     pub user: UdpSocket,
@@ -76,7 +83,12 @@ enum Waits {
 }
 
 impl Shared {
-    pub fn new(engine: Engine, flow: Flow, sockets: Sockets, network: Network) -> Arc<Self> {
+    pub fn new(
+        engine: Engine,
+        flow: Flow,
+        sockets: Sockets,
+        network: Network,
+    ) -> io::Result<Arc<Self>> {
         let Sockets {
             discovery,
             user,
@@ -91,12 +103,12 @@ impl Shared {
         let shared = Self {
             core,
             wake: Notify::new(),
-            discovery,
-            user,
-            multicast,
+            discovery: incoming(discovery)?,
+            user: incoming(user)?,
+            multicast: multicast.map(incoming).transpose()?,
         };
         shared.join_groups(&mut shared.core.lock(), network);
-        Arc::new(shared)
+        Ok(Arc::new(shared))
     }
 
     /// The interfaces of this machine, as they are now.
@@ -114,7 +126,7 @@ impl Shared {
     fn join_groups(&self, core: &mut Core, network: Network) {
         core.flow.set_own(network.addresses());
         if let Some(socket) = &self.multicast {
-            let socket = SockRef::from(socket);
+            let socket = SockRef::from(socket.get_ref());
             for address in network.addresses() {
                 match socket.join_multicast_v4(&MULTICAST, &address) {
                     Ok(()) => {}
@@ -166,8 +178,8 @@ impl Shared {
                 self.send_to_all(&datagram, network);
                 continue;
             }
-            match SockRef::from(&self.user).send_to_vectored(&datagram.parts(), &datagram.to.into())
-            {
+            let socket = SockRef::from(self.user.get_ref());
+            match socket.send_to_vectored(&datagram.parts(), &datagram.to.into()) {
                 Ok(_) => {}
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                     *stalled = Some(datagram);
@@ -181,7 +193,7 @@ impl Shared {
 
     /// Sends a datagram out of each interface. One that cannot be sent is said again with the next announcement.
     fn send_to_all(&self, datagram: &Datagram, network: &Network) {
-        let socket = SockRef::from(&self.user);
+        let socket = SockRef::from(self.user.get_ref());
         for address in network.addresses() {
             let sent = socket
                 .set_multicast_if_v4(&address)
@@ -193,11 +205,12 @@ impl Shared {
     }
 
     /// Takes what has come on a socket.
-    fn take(&self, socket: &UdpSocket, buffer: &mut Vec<u8>) {
+    fn take(&self, mut ready: AsyncFdReadyGuard<'_, UdpSocket>, buffer: &mut Vec<u8>) {
         let mut came = Vec::with_capacity(AT_ONCE);
         while came.len() < AT_ONCE {
             buffer.resize(LONGEST, 0);
-            let Ok((length, source)) = socket.try_recv_from(buffer) else {
+            let received = ready.try_io(|socket| socket.get_ref().recv_from(buffer));
+            let Ok(Ok((length, source))) = received else {
                 break;
             };
             let datagram = if length <= COPIED {
@@ -296,24 +309,44 @@ pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
         }
         let multicast = async {
             match &shared.multicast {
-                Some(socket) => socket.readable().await.map(|()| socket),
+                Some(socket) => socket.readable().await,
                 None => std::future::pending().await,
             }
         };
         tokio::select! {
-            Ok(()) = shared.user.readable() => shared.take(&shared.user, &mut buffer),
-            Ok(()) = shared.discovery.readable() => shared.take(&shared.discovery, &mut buffer),
-            Ok(socket) = multicast => shared.take(socket, &mut buffer),
+            Ok(ready) = shared.user.readable() => shared.take(ready, &mut buffer),
+            Ok(ready) = shared.discovery.readable() => shared.take(ready, &mut buffer),
+            Ok(ready) = multicast => shared.take(ready, &mut buffer),
             Ok(mut ready) = timer.readable(), if matches!(waits, Waits::Receivers(_)) => {
                 let mut expirations = [0; 8];
                 let _ = rustix::io::read(timer.get_ref(), &mut expirations);
                 ready.clear_ready();
             }
-            Ok(()) = shared.user.writable(), if waits == Waits::Socket => {}
+            () = room(shared.user.get_ref()), if waits == Waits::Socket => {}
             () = tokio::time::sleep_until(tick_at.into()) => shared.tick(),
             () = shared.wake.notified() => {}
             _ = ports.tick(), if sees => shared.look_at_ports(),
         }
+    }
+}
+
+fn incoming(socket: UdpSocket) -> io::Result<Incoming> {
+    // SAFETY: the descriptor belongs to what is returned alone, which never gives it away: it is open as long as it is registered.
+    Ok(unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }?)
+}
+
+/// Waits until a socket has room for a datagram.
+async fn room(socket: &UdpSocket) {
+    let waited = async {
+        let same = socket.try_clone()?;
+        // SAFETY: as with `incoming`.
+        let same = unsafe { AsyncFd::register_with_interest(same, Interest::WRITABLE) }?;
+        same.writable().await?.retain_ready();
+        io::Result::Ok(())
+    };
+    if let Err(error) = waited.await {
+        tracing::debug!(%error, "it is not told when a DDS participant's socket has room");
+        tokio::time::sleep(NO_ROOM).await;
     }
 }
 

@@ -298,11 +298,11 @@ impl Participant {
         );
         let guid = engine.guid();
         let sockets = Sockets {
-            discovery,
-            user,
-            multicast,
+            discovery: discovery.into_std()?,
+            user: user.into_std()?,
+            multicast: multicast.map(UdpSocket::into_std).transpose()?,
         };
-        let shared = Shared::new(engine, flow, sockets, network);
+        let shared = Shared::new(engine, flow, sockets, network)?;
         let task = tokio::spawn(drive(Arc::clone(&shared), ports_each)).abort_handle();
         let looking = (!config.interfaces.is_loopback()).then(|| {
             let looking = look_again(Arc::clone(&shared), place, config.interfaces);
