@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::awake::Awake;
 use crate::rivals::Rival;
-use crate::world::{Program, Transport, World, number};
+use crate::world::{Host, Program, Transport, World, number};
 
 /// Per turn. A server of rclpy tells of all goals of the last fifteen minutes whenever one changes: of few there is little to tell.
 const TRIPS: &str = "2000";
@@ -109,9 +109,11 @@ impl Way {
 
     /// p50 and p99 of one turn, in microseconds.
     fn turn(&self, role: &str) -> Result<[f64; 2]> {
-        let world = World::new()?;
+        let mut world = World::new()?;
+        world.place(Host::Server)?;
         let _answers = self.answers(&world)?;
         let _server = self.server(&world)?;
+        world.place(Host::Robot)?;
         let found: Value = self.asks(&world, role)?.answer_within(PATIENCE)?;
         let times = [number(&found, "p50")?, number(&found, "p99")?];
         ensure!(

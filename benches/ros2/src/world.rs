@@ -25,24 +25,61 @@ pub(crate) enum Transport {
     Udp,
 }
 
+/// On which cores programs run. A robot and a server are two machines, whose programs never share a core. Where the kernel chooses, two
+/// programs that answer each other are on one core or on two by chance, and a way then takes twice or half of what it took before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Host {
+    /// The first core.
+    Robot,
+    /// All others.
+    Server,
+}
+
+impl Host {
+    /// As `taskset` takes them; none where there is only one.
+    fn cores(self) -> Result<Option<String>> {
+        let count = std::thread::available_parallelism()?.get();
+        Ok(match self {
+            _ if count < 2 => None,
+            Self::Robot => Some("0".to_owned()),
+            Self::Server => Some(format!("1-{}", count - 1)),
+        })
+    }
+}
+
 /// Both namespaces.
-pub(crate) struct World(Program);
+pub(crate) struct World {
+    holder: Program,
+    cores: Option<String>,
+}
 
 impl World {
     /// New ones, with `lo` up.
     pub(crate) fn new() -> Result<Self> {
         let mut holder = Command::new("unshare");
         holder.args(["--net", "--mount", "sh", "-c", HOLD]);
-        Program::start(holder, "a network namespace").map(Self)
+        Ok(Self {
+            holder: Program::start(holder, "a network namespace")?,
+            cores: None,
+        })
+    }
+
+    /// Where what is started from now on runs.
+    pub(crate) fn place(&mut self, host: Host) -> Result<()> {
+        self.cores = host.cores()?;
+        Ok(())
     }
 
     /// What a program's words are added to that is to run there.
     pub(crate) fn inside(&self) -> Command {
         let mut command = Command::new("nsenter");
         for (option, file) in [("net", "net"), ("mount", "mnt")] {
-            command.arg(format!("--{option}=/proc/{}/ns/{file}", self.0.pid()));
+            command.arg(format!("--{option}=/proc/{}/ns/{file}", self.holder.pid()));
         }
         command.arg("--");
+        if let Some(cores) = &self.cores {
+            command.args(["taskset", "--cpu-list", cores]);
+        }
         command
     }
 
