@@ -16,6 +16,7 @@ use rootfs_builder::probe::{ProbeError, ProbeOptions, still};
 use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::{Called, Flavour};
 use ros::plumbing;
+use ros::ros2;
 use ros::ros2::composition::Component;
 use servant::engine::Servant;
 use servant::spec::NodeSpec;
@@ -173,7 +174,9 @@ fn names(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> Names
             }
             RosVersion::Two => {
                 let own = graph.enclaves.get(&mark).into_iter().flatten();
-                own.map(String::as_str).collect()
+                // What tools do not show is no name to call a program by.
+                let shown = own.filter(|node| !ros2::names::is_hidden(node));
+                shown.map(String::as_str).collect()
             }
         };
         // A program may take no notice of its mark; alone it is known all the same.

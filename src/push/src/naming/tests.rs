@@ -262,7 +262,7 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
                 "/cloudroid_name_0",
                 names_of(&["/camera/detector", "/talker"]),
             ),
-            ("/cloudroid_name_1", names_of(&["/talker"])),
+            ("/cloudroid_name_1", names_of(&["/_worker", "/talker"])),
             ("/cloudroid_name_2", names_of(&["/push_1_names/ntp"])),
             (
                 "/cloudroid_name_3",

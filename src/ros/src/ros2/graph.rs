@@ -19,7 +19,7 @@ struct End<'a> {
 }
 
 /// The graph of all nodes; `own` are the ends of the node of this name and participant. Names that begin with `_` somewhere are
-/// left out, and so are ends of whose node nothing is known yet.
+/// left out of what is shown, and so are ends of whose node nothing is known yet.
 pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid)) -> Graph {
     let mut building = Building::default();
     for end in ends(seen, own, node) {
@@ -44,10 +44,9 @@ pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid
     let enclaves = seen.enclaves.iter();
     graph.enclaves = enclaves
         .map(|(enclave, nodes)| {
-            let shown = nodes.iter().filter(|name| !names::is_hidden(name));
             (
                 enclave.clone(),
-                shown.map(|name| name.to_string()).collect(),
+                nodes.iter().map(|name| name.to_string()).collect(),
             )
         })
         .collect();
@@ -346,8 +345,11 @@ mod tests {
         let graph = build(&seen, &OwnEnds::default(), ("/us", guid(9, 0, true)));
         let nodes = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
         let expected = [
-            ("/a/b".to_owned(), nodes(&["/own_2", "/see"])),
-            ("/c".to_owned(), nodes(&["/own_3", "/own_4", "/see"])),
+            ("/a/b".to_owned(), nodes(&["/_hidden", "/own_2", "/see"])),
+            (
+                "/c".to_owned(),
+                nodes(&["/_hidden", "/own_3", "/own_4", "/see"]),
+            ),
         ];
         assert_eq!(graph.enclaves, expected.into());
     }
