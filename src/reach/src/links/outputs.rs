@@ -24,6 +24,8 @@ use ros::codec::Stamps;
 
 /// Messages that the bus keeps for a busy link.
 const QUEUE: usize = 256;
+/// Publishers of a topic that are remembered.
+const REMEMBERED: usize = 256;
 /// Between two questions whether a node sends a topic to us, at first and at last.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
 const LONGEST_LOOK: std::time::Duration = std::time::Duration::from_millis(50);
@@ -159,11 +161,26 @@ impl Outputs {
                 let _ = tokio::time::timeout(warm_up, heard).await;
                 drop(hold);
             };
+            let mut met = subscription.matched.clone();
+            met.mark_changed();
             let read = async {
-                while let Some(message) = subscription.messages.recv().await {
-                    let Some(hub) = hub.upgrade() else { break };
+                let mut own = OwnPublishers::default();
+                loop {
+                    let message = tokio::select! {
+                        biased;
+                        Ok(()) = met.changed() => {
+                            let Some(hub) = hub.upgrade() else { break };
+                            let present = met.borrow_and_update().clone();
+                            own.meet(&present, |node| hub.is_of(&reader, node));
+                            continue;
+                        }
+                        message = subscription.messages.recv() => message,
+                    };
+                    let (Some(message), Some(hub)) = (message, hub.upgrade()) else {
+                        break;
+                    };
                     // Other nodes of the servant have links of their own.
-                    if hub.is_of(&reader, message.publisher.node()) {
+                    if own.has(&message.publisher, |node| hub.is_of(&reader, node)) {
                         let bytes = reader.shift(&hub, Direction::Out, &stamps, message.bytes);
                         reader.send(channel, bytes, message.latching);
                     }
@@ -175,6 +192,35 @@ impl Outputs {
             known.reading = Some(reading.abort_handle());
         } else {
             reading.abort();
+        }
+    }
+}
+
+/// Publishers of a topic that are known to be of the link's process: what one has sent before it was gone still is the process's, and the graph
+/// has no node of its name any more.
+#[derive(Default)]
+struct OwnPublishers(BTreeSet<PeerId>);
+
+impl OwnPublishers {
+    fn has(&mut self, publisher: &PeerId, is_of: impl Fn(&str) -> bool) -> bool {
+        if self.0.contains(publisher) {
+            return true;
+        }
+        let has = is_of(publisher.node());
+        if has {
+            // Whoever made so many is not worth being remembered.
+            if self.0.len() >= REMEMBERED {
+                self.0.clear();
+            }
+            self.0.insert(publisher.clone());
+        }
+        has
+    }
+
+    /// These are there now.
+    fn meet(&mut self, present: &Matched, is_of: impl Fn(&str) -> bool) {
+        for peer in present.peers.iter().filter(|peer| peer.connected) {
+            self.has(&peer.id, &is_of);
         }
     }
 }
@@ -246,5 +292,38 @@ impl NodeLink {
             Quality::Newest
         };
         self.session.publish(data, quality);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::bus::Peer;
+
+    use super::*;
+
+    #[test]
+    fn what_a_node_has_sent_is_its_processs_when_it_is_gone() {
+        let peer = |node: &str, number: u64| PeerId::new(node, u128::from(number));
+        let (mut own, gone) = (OwnPublishers::default(), |_: &str| false);
+        let is_of = |node: &str| node == "/tenor";
+        assert!(own.has(&peer("/tenor", 1), is_of));
+        assert!(!own.has(&peer("/bass", 1), is_of));
+        assert!(own.has(&peer("/tenor", 1), gone) && !own.has(&peer("/tenor", 2), gone));
+        // It has sent nothing yet that was looked at.
+        let there = |id: PeerId| Peer {
+            id,
+            connected: true,
+            offer: None,
+        };
+        let present = Matched {
+            peers: vec![there(peer("/tenor", 2)), there(peer("/bass", 2))],
+            ..Matched::default()
+        };
+        own.meet(&present, is_of);
+        assert!(own.has(&peer("/tenor", 2), gone) && !own.has(&peer("/bass", 2), gone));
+        for number in 0..2 * REMEMBERED as u64 {
+            own.has(&peer("/tenor", number), is_of);
+        }
+        assert!(own.0.len() <= REMEMBERED);
     }
 }

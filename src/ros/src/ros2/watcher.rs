@@ -87,6 +87,17 @@ impl Watcher {
         self.tell(nodes, seen.gids);
         let bus = &self.bus;
         let mut now = graph::build(&seen, &own, (bus.node.as_str(), bus.participant.guid()));
+        // Whoever is woken by what is seen (a message is named by it, say) finds the graph as new; whoever is woken by the graph, what is seen.
+        let mut news = false;
+        bus.graph.send_if_modified(|before| {
+            now.generation = before.generation;
+            news = **before != now;
+            if news {
+                now.generation += 1;
+                *before = Arc::new(now);
+            }
+            false
+        });
         bus.seen.send_replace(Arc::clone(&seen));
         calls::forget_unserved(bus, &seen);
         let services = bus.services.lock();
@@ -95,15 +106,7 @@ impl Watcher {
             .map(|(name, served)| (name.as_str(), &served.of));
         self.other_types.look(served, &seen);
         drop(services);
-        bus.graph.send_if_modified(|before| {
-            now.generation = before.generation;
-            let news = **before != now;
-            if news {
-                now.generation += 1;
-                *before = Arc::new(now);
-            }
-            news
-        });
+        bus.graph.send_if_modified(|_| news);
     }
 
     /// Ends that were not named in time are late from then on.
