@@ -13,6 +13,7 @@ mod calls;
 pub mod diagnostics;
 mod dropped;
 mod inputs;
+mod known;
 mod lent;
 mod outputs;
 mod parameters;
@@ -177,7 +178,7 @@ impl Mirror {
         self.outputs.apply(self, &graph.outputs, keeps).await;
         self.inputs.apply(self, &graph.inputs, keeps);
         self.calls.apply(self, &graph.services, (true, keeps)).await;
-        self.learn(graph).await;
+        self.learn(graph, applied.settled).await;
     }
 }
 

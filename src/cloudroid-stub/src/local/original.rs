@@ -66,6 +66,21 @@ pub struct Interface {
     pub outputs: Vec<String>,
     /// What it serves.
     pub services: Vec<String>,
+    /// Of all this, what lies below further nodes of its process: their names may be others in each of its lives (a listener to transforms has a random one), so
+    /// that nothing of it is waited for that is not awaited, and that no longer than for the rest.
+    pub of_others: BTreeSet<String>,
+}
+
+impl Interface {
+    /// Whether this is waited for, as long as things have time to be registered.
+    pub(super) fn waits_for(&self, name: &str) -> bool {
+        self.awaited.contains(name) || !self.of_others.contains(name)
+    }
+
+    /// Whether it is given nothing before it listens to this, however long that takes.
+    fn must_listen_to(&self, topic: &str) -> bool {
+        self.awaited.contains(topic) && !self.of_others.contains(topic)
+    }
 }
 
 /// What comes back.
@@ -408,7 +423,7 @@ impl Runner {
             let inputs = self.publishers.lock();
             let due = inputs
                 .iter()
-                .filter(|(topic, _)| expected.awaited.contains(*topic) || listens(topic));
+                .filter(|(topic, _)| expected.must_listen_to(topic) || listens(topic));
             due.map(|(_, input)| input.matched()).collect()
         };
         for end in ends {

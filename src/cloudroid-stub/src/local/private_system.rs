@@ -166,26 +166,15 @@ impl PrivateSystem {
 
     /// Returns once the process of `node` has registered all of this.
     pub async fn registers(&self, node: &str, all: &Interface) {
-        self.until(|graph| {
-            let nodes = self.nodes_of(graph, node);
-            let any = |has: fn(&Graph, &str, &str) -> bool, name: &str| {
-                nodes.iter().any(|node| has(graph, node, name))
-            };
-            let listens = |topic: &String| any(seen::subscribes, topic);
-            let says = |topic: &String| any(seen::publishes, topic);
-            let serves = |service: &String| any(seen::serves, service);
-            all.inputs.keys().all(listens)
-                && all.outputs.iter().all(says)
-                && all.services.iter().all(serves)
-        })
-        .await;
+        self.until(|graph| has_all(graph, &self.nodes_of(graph, node), all))
+            .await;
     }
 
     /// What the process of `node` has registered, as far as its types can be told.
     pub async fn registered_by(&self, node: &str) -> Registered {
         let graph = self.graph();
         if self.bus.version() == RosVersion::Two {
-            return by_ends(&graph, &self.nodes_of(&graph, node));
+            return by_ends(&graph, node, &self.nodes_of(&graph, node));
         }
         let mut registered = Registered::default();
         for topic in graph.topics.keys() {
@@ -231,8 +220,21 @@ impl PrivateSystem {
     }
 }
 
-/// What the ends of a process of ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
-fn by_ends(graph: &Graph, nodes: &BTreeSet<String>) -> Registered {
+/// Whether these nodes have what is waited for.
+fn has_all(graph: &Graph, nodes: &BTreeSet<String>, all: &Interface) -> bool {
+    let any = |has: fn(&Graph, &str, &str) -> bool, name: &str| {
+        !all.waits_for(name) || nodes.iter().any(|node| has(graph, node, name))
+    };
+    let listens = |topic: &String| any(seen::subscribes, topic);
+    let says = |topic: &String| any(seen::publishes, topic);
+    let serves = |service: &String| any(seen::serves, service);
+    all.inputs.keys().all(listens)
+        && all.outputs.iter().all(says)
+        && all.services.iter().all(serves)
+}
+
+/// What the ends of the process of `node` in ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
+fn by_ends(graph: &Graph, node: &str, nodes: &BTreeSet<String>) -> Registered {
     let ends = graph.ends_of(nodes);
     let names = nodes.iter().filter_map(|node| {
         let mut names = graph.ends.get(node)?.names();
@@ -253,9 +255,44 @@ fn by_ends(graph: &Graph, nodes: &BTreeSet<String>) -> Registered {
         services: services
             .map(|(service, of)| (service.clone(), of.clone()))
             .collect(),
-        nodes: match names.len() {
-            0 | 1 => BTreeMap::new(),
-            _ => names,
+        nodes: match names.keys().all(|name| name == node) {
+            true => BTreeMap::new(),
+            false => names,
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_has_a_name_of_one_life_is_not_waited_for() {
+        let served = ["/see/set", "/tf_2/get_type_description"];
+        let served = served.map(|name| (name.to_owned(), "/see".to_owned()));
+        let graph = Graph {
+            services: served.into(),
+            ..Graph::default()
+        };
+        let nodes = BTreeSet::from(["/see".to_owned()]);
+        let mut all = Interface {
+            services: ["/see/set", "/tf_1/get_type_description"]
+                .map(str::to_owned)
+                .into(),
+            ..Interface::default()
+        };
+        assert!(!has_all(&graph, &nodes, &all));
+        all.of_others = [all.services[1].clone()].into();
+        assert!(has_all(&graph, &nodes, &all));
+        // But what is to be given to it is.
+        let goal = "/see/goal".to_owned();
+        all.inputs = [(goal.clone(), WireType::any())].into();
+        all.of_others.insert(goal.clone());
+        assert!(has_all(&graph, &nodes, &all));
+        all.awaited = [goal].into();
+        assert!(!has_all(&graph, &nodes, &all));
+        all.awaited.clear();
+        all.services.push("/see/more".to_owned());
+        assert!(!has_all(&graph, &nodes, &all));
     }
 }

@@ -1,6 +1,5 @@
 //! The mirror's side of the promise: a [`Keeper`] between the robot's messages, the link and the local original.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Weak};
 
 use anyhow::{Context, bail};
@@ -10,27 +9,18 @@ use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
     Correlation, Event, Failure, HandOver, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side,
-    Sla, Topic, Warm,
+    Sla, Warm,
 };
-use ros::bus::{Bus, Message, Qos, WireType};
+use ros::bus::{Bus, Message};
 use serde_json::json;
 
 use super::Mirror;
 use super::diagnostics::Diagnostics;
+use super::known::Known;
 use super::reports::{self, Reports};
 use super::safe_stop::{self, Stop};
 use crate::config::{self, Config};
-use crate::local::{self, Answer, Application, Cloud, Interface, Keeper, Original, Setting};
-
-/// What is known of the interface so far: lazy inputs become known later, and do not go again.
-#[derive(Default)]
-pub struct Known {
-    inputs: BTreeMap<String, WireType>,
-    /// The quality of service that the node asks for, where that is told.
-    asked: BTreeMap<String, Qos>,
-    outputs: BTreeMap<String, WireType>,
-    told: BTreeSet<String>,
-}
+use crate::local::{Answer, Application, Cloud, Interface, Keeper, Original, Setting};
 
 /// The SLA that a configuration states. Where it promises nothing the local original stands in while the link is away;
 /// none where there is to be no local original either.
@@ -183,29 +173,15 @@ impl Mirror {
         self.promise.get().map(|promise| &promise.keeper)
     }
 
-    /// The graph has changed: there may be more to pair.
-    pub(super) async fn learn(&self, graph: &Graph) {
+    /// The graph has changed: there may be more to pair. `settled`: what it does not list is gone.
+    pub(super) async fn learn(&self, graph: &Graph, settled: bool) {
         let Some(promise) = self.promise.get() else {
             return;
         };
         let (pairs, interface) = {
             let mut known = promise.known.lock();
-            for input in graph
-                .inputs
-                .iter()
-                .filter(|input| input.feed && input.type_name != "*")
-            {
-                let found = self.wire_type(&input.type_name, &input.md5);
-                known.inputs.insert(input.topic.clone(), found);
-                if let Some(qos) = &input.qos {
-                    let asked = qos.to_qos(local::QUEUE);
-                    known.asked.insert(input.topic.clone(), asked);
-                }
-            }
-            for output in &graph.outputs {
-                let found = self.wire_type(&output.type_name, &output.md5);
-                known.outputs.insert(output.topic.clone(), found);
-            }
+            let wire_type = |name: &str, md5: &str| self.wire_type(name, md5);
+            known.note(graph, self.bus.node(), settled, wire_type);
             let types = known.inputs.values().chain(known.outputs.values());
             promise.keeper.learn_types(types);
             let mut found = known.find(promise.answers.as_deref());
@@ -230,30 +206,13 @@ impl Mirror {
                     .iter()
                     .map(|service| service.name.clone())
                     .collect(),
+                of_others: known.of_others.keys().cloned().collect(),
             };
             (found.pairs, interface)
         };
         if let Err(error) = promise.keeper.learn(pairs, interface).await {
             tracing::warn!("the local original cannot be fed: {error:#}");
         }
-    }
-}
-
-impl Known {
-    /// Pairs what is known; each of `answers` whose topics are known already: the rest may come.
-    fn find(&self, answers: Option<&[Pair]>) -> qos::Found {
-        let (inputs, outputs) = (topics(&self.inputs), topics(&self.outputs));
-        let Some(answers) = answers else {
-            return qos::find(&inputs, &outputs, None).unwrap_or_default();
-        };
-        let mut found = qos::Found::default();
-        for pair in answers {
-            match qos::find(&inputs, &outputs, Some(std::slice::from_ref(pair))) {
-                Ok(one) => found.pairs.extend(one.pairs),
-                Err(reason) => tracing::debug!(reason, "no request yet"),
-            }
-        }
-        found
     }
 }
 
@@ -274,15 +233,6 @@ impl Promise {
     pub fn keeper(&self) -> &Arc<Keeper> {
         &self.keeper
     }
-}
-
-fn topics(known: &BTreeMap<String, WireType>) -> Vec<Topic> {
-    let topic = |(name, wire_type): (&String, &WireType)| Topic {
-        name: name.clone(),
-        type_name: wire_type.name.replacen("/msg/", "/", 1),
-        stamped: local::is_stamped(wire_type),
-    };
-    known.iter().map(topic).collect()
 }
 
 /// Tells the keeper whether the link is up, over all sessions.
@@ -499,29 +449,6 @@ mod tests {
         let swapped = own("requests = [{ request = '/s', desire = 4, max = 3 }]").unwrap_err();
         let swapped = format!("{swapped:#}");
         assert!(swapped.contains("requests./s.t_max"), "{swapped}");
-    }
-
-    #[test]
-    fn requests_are_known_one_by_one() {
-        let mut known = Known::default();
-        let pairs = ["/a -> /b", "/c -> /d"].map(|pair| pair.parse().unwrap());
-        let topic = |name: &str| (name.to_owned(), WireType::named("std_msgs/String"));
-        known.inputs.extend([topic("/a"), topic("/c")]);
-        known.outputs.extend([topic("/b")]);
-        let found = |known: &Known| {
-            let found = known.find(Some(&pairs));
-            found
-                .pairs
-                .iter()
-                .map(ToString::to_string)
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(found(&known), ["/a -> /b by arrival"]);
-        known.outputs.extend([topic("/d")]);
-        assert_eq!(
-            found(&known),
-            ["/a -> /b by arrival", "/c -> /d by arrival"]
-        );
     }
 
     #[test]

@@ -63,13 +63,16 @@ impl Mirror {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),
             services: registered.services.into_iter().map(serves).collect(),
+            nodes: (registered.nodes.iter())
+                .map(|(node, names)| (node.clone(), names.clone().into()))
+                .collect(),
             ..Graph::default()
         };
         applied.nodes = registered.nodes;
         self.bus.stands_for(applied.nodes.clone());
         // What it says has somewhere to go before it is heard, and what it is given comes once it listens.
         self.outputs.apply(self, &graph.outputs, true).await;
-        self.learn(&graph).await;
+        self.learn(&graph, false).await;
         original.connected().await;
         self.inputs.apply(self, &graph.inputs, true);
         self.calls.apply(self, &graph.services, (false, true)).await;
