@@ -143,11 +143,8 @@ fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, S
     }
     for (program, path) in &inventory.programs {
         let nodes = revision.plan.nodes.iter();
-        let mut nodes: Vec<_> = nodes.filter(|node| node.argv.contains(path)).collect();
-        if nodes.len() > 1 {
-            nodes.retain(|node| !arguments::gives_name(&node.argv));
-        }
-        if let [node] = &nodes[..] {
+        let nodes: Vec<_> = nodes.filter(|node| node.argv.contains(path)).collect();
+        if let Some(node) = arguments::named_by_program(nodes, |node| &node.argv) {
             let name = match node.name.rsplit_once('/') {
                 Some(("", name)) => name,
                 Some((_, name)) if arguments::gives_namespace(&node.argv) => name,

@@ -13,6 +13,7 @@ use link::control::{Decision, Exit, Node, Request};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use ros::flavour::{Identity, Naming};
+use ros::ros2::arguments;
 use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
@@ -120,22 +121,20 @@ pub(crate) fn running<'a>(
     })
 }
 
-/// What a program is told of its nodes' names: nothing that the robot has not said, but for what the push has told the program, so that a node whose own
-/// name is another each time, say, has one.
+/// What a program is told of its nodes' names: nothing that the robot has not said, but for what the push has told the node that the stub is called by, so that one
+/// whose own name is another each time, say, has one. What it has told others of the same program (`name=` of a second one) is nothing to this one.
 fn told(recorded: &Recorded, node: &Node) -> Naming {
     if !node.named_by_argv {
         return Naming::default();
     }
-    let planned = running(recorded, &node.executable);
-    let said = planned.map(|planned| recorded.flavour.says_to_all(&planned.argv));
-    let nothing = Naming {
-        name: false,
-        namespace: false,
-    };
-    said.fold(nothing, |all, one| Naming {
-        name: all.name || one.name,
-        namespace: all.namespace || one.namespace,
-    })
+    let planned: Vec<_> = running(recorded, &node.executable).collect();
+    match arguments::named_by_program(planned, |planned| &planned.argv) {
+        Some(planned) => recorded.flavour.says_to_all(&planned.argv),
+        None => Naming {
+            name: false,
+            namespace: false,
+        },
+    }
 }
 
 #[async_trait]
@@ -418,6 +417,9 @@ mod tests {
         assert_eq!(said(&[&moved], true), (false, true));
         let second = format!("{plain} --ros-args -r see:__node:=see_2");
         assert_eq!(said(&[plain, &second], true), (false, false));
+        // What another of the same program is told it is told alone.
+        assert_eq!(said(&[plain, &renamed], true), (false, false));
+        assert_eq!(said(&[&moved, &renamed], true), (false, true));
         let other = "/opt/mine/lib/vision/look.py --ros-args -r __node:=look";
         assert_eq!(said(&[plain, other], true), (false, false));
     }

@@ -222,6 +222,14 @@ fn renames(argv: &[String], is_meant: impl Fn(&Rule) -> bool) -> bool {
     kinds.any(|kind| matches!(kind, Kind::Rule(rule) if is_meant(rule)))
 }
 
+/// Of the nodes that run one program the one that a stub of it is called by: the only one, or the only one that is told no name.
+pub fn named_by_program<T>(mut nodes: Vec<T>, argv: impl Fn(&T) -> &[String]) -> Option<T> {
+    if nodes.len() > 1 {
+        nodes.retain(|node| !gives_name(argv(node)));
+    }
+    nodes.pop().filter(|_| nodes.is_empty())
+}
+
 /// What of its nodes' names a command line says to all of them, by rules that are not for one alone.
 pub fn says_to_all(argv: &[String]) -> Naming {
     let says = |renamed: Renamed| renames(argv, |rule| rule.of == renamed && rule.node.is_none());
