@@ -80,14 +80,17 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     let Ok(parameters) = hub.bus.node_parameters() else {
         return;
     };
-    let service = format!("{}/get_parameters", link.node);
-    let answers = |graph: &Arc<Graph>| graph.services.contains_key(&service);
     let mut graphs = hub.bus.graph();
     // Once for each of its lives: one that starts again has the value that it was started with.
-    while graphs.wait_for(answers).await.is_ok() {
+    loop {
+        let answers = graphs.wait_for(|graph| asked(graph, &link.node).is_some());
+        let Ok(Some(node)) = answers.await.map(|graph| asked(&graph, &link.node)) else {
+            return;
+        };
+        let is_another = |graph: &Arc<Graph>| asked(graph, &link.node).as_ref() != Some(&node);
         let followed = tokio::select! {
-            followed = lives(&link, parameters) => followed,
-            _ = graphs.wait_for(|graph| !answers(graph)) => continue,
+            followed = lives(&link, &node, parameters) => followed,
+            _ = graphs.wait_for(is_another) => continue,
         };
         match followed {
             Ok(()) | Err(BusError::NotOffered(_)) => return,
@@ -99,11 +102,28 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     }
 }
 
+/// Whom to ask: the node, or, where its program has called none so, another one of its process.
+fn asked(graph: &Graph, node: &str) -> Option<String> {
+    let answers = |node: &String| {
+        let service = format!("{node}/get_parameters");
+        graph.services.contains_key(&service)
+    };
+    let own = node.to_owned();
+    if answers(&own) || graph.ends.contains_key(node) {
+        return Some(own).filter(answers);
+    }
+    graph.of_process(node).into_iter().find(answers)
+}
+
 /// One life of the node, or until the bus is closed.
-async fn lives(link: &NodeLink, parameters: &dyn NodeParameters) -> Result<(), BusError> {
-    let mut events = parameters.watch(Some(&link.node)).await?;
+async fn lives(
+    link: &NodeLink,
+    node: &str,
+    parameters: &dyn NodeParameters,
+) -> Result<(), BusError> {
+    let mut events = parameters.watch(Some(node)).await?;
     let asked = [SIMULATED.to_owned()];
-    let held = parameters.get(&link.node, &asked).await?;
+    let held = parameters.get(node, &asked).await?;
     if let Some(Some(ParamValue::Bool(simulated))) = held.first() {
         link.time.simulate(*simulated);
     }
@@ -115,4 +135,31 @@ async fn lives(link: &NodeLink, parameters: &dyn NodeParameters) -> Result<(), B
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use ros::bus::NodeEnds;
+
+    use super::*;
+
+    #[test]
+    fn another_node_of_the_process_is_asked_where_none_is_called_so() {
+        let service = |node: &str| (format!("{node}/get_parameters"), node.to_owned());
+        let mark = "/cloudroid_link/front".to_owned();
+        let process = |nodes: &[&str]| nodes.iter().map(ToString::to_string).collect();
+        let mut graph = Graph {
+            services: [service("/rear"), service("/alien")].into(),
+            enclaves: [(mark, process(&["/rear"]))].into(),
+            ..Graph::default()
+        };
+        assert_eq!(asked(&graph, "/front").as_deref(), Some("/rear"));
+        assert_eq!(asked(&graph, "/bass"), None);
+        // It is there, and will answer.
+        let ends = NodeEnds::default();
+        graph.ends.insert("/front".to_owned(), ends);
+        assert_eq!(asked(&graph, "/front"), None);
+        graph.services.extend([service("/front")]);
+        assert_eq!(asked(&graph, "/front").as_deref(), Some("/front"));
+    }
 }

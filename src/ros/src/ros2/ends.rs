@@ -30,11 +30,20 @@ pub(super) struct OwnEnds {
 }
 
 impl OwnEnds {
-    /// What the others are told: this node, of this name, and the others that it stands for. An end may be of several.
+    /// What the others are told: the nodes that this one stands for, or else this node, of this name. An end may be of several; what is of none is the
+    /// node's of this name, or, where the program has called none so, the first one's.
     pub(super) fn nodes(&self, own: &str, others: &BTreeMap<String, NodeNames>) -> Vec<Node> {
         let mut nodes: BTreeMap<&str, Node> = BTreeMap::new();
-        let names = others.keys().map(String::as_str);
-        for name in names.chain([own]) {
+        let mut names: Vec<&str> = others.keys().map(String::as_str).collect();
+        let own = match names.first() {
+            Some(first) if !names.contains(&own) => first,
+            Some(_) => own,
+            None => {
+                names.push(own);
+                own
+            }
+        };
+        for name in names {
             let node = Node {
                 name: name.into(),
                 readers: Vec::new(),
@@ -268,6 +277,10 @@ mod tests {
         let ears_all = ("/ears".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
         assert_eq!(told(&BTreeMap::new()), [ears_all]);
         let others = [("/ears".to_owned(), ears), ("/mouth".to_owned(), mouth)];
+        // The program was told another name: no node of the stub's is there beside it.
+        let bass = BTreeMap::from([("/bass".to_owned(), NodeNames::default())]);
+        let bass_all = ("/bass".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
+        assert_eq!(told(&bass), [bass_all]);
         // What no node is said to have is the stub's own.
         let expected = [
             ("/ears".to_owned(), vec![1, 3], vec![4, 6, 7]),
