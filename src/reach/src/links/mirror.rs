@@ -11,6 +11,9 @@ use super::{Hub, types};
 use link::control::{FromCloud, Graph, Output, Served, Wanted};
 use ros::codec::Stamps;
 
+/// Nodes that a robot is warned of.
+const WARNED: usize = 20;
+
 /// What was told so far.
 #[derive(Default)]
 struct Sent {
@@ -19,6 +22,8 @@ struct Sent {
     services: BTreeMap<String, (u32, ServiceType)>,
     next: u32,
     graph: Option<Graph>,
+    /// Nodes that it was warned of.
+    warned: BTreeSet<String>,
 }
 
 /// Tells the robot of every change, until the link ends.
@@ -46,6 +51,7 @@ impl Sent {
         if before != listening {
             hub.changed();
         }
+        self.warn_of_shared(link, graph.shared_of_process(&link.node));
         let mut graph = Graph {
             siblings: hub.siblings(&graph, &link.node),
             nodes: seen::owners(&graph, &link.node),
@@ -82,6 +88,22 @@ impl Sent {
         if self.graph.as_ref() != Some(&graph) {
             link.session.report(&FromCloud::Graph(graph.clone()));
             self.graph = Some(graph);
+        }
+    }
+
+    /// Warns once of each further node that is left out.
+    fn warn_of_shared(&mut self, link: &NodeLink, shared: BTreeSet<String>) {
+        for name in shared {
+            if self.warned.len() < WARNED && !self.warned.contains(&name) {
+                link.session.report(&FromCloud::Notice {
+                    warning: true,
+                    text: format!(
+                        "node {name} of {} is not on the robot: another program of this servant has a node of the same name; give each a name of its own (-r NODE:__node:=NAME)",
+                        link.node
+                    ),
+                });
+                self.warned.insert(name);
+            }
         }
     }
 

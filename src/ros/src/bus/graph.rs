@@ -64,21 +64,36 @@ impl Graph {
     }
 
     /// The nodes of the process that a servant runs as a robot's node of this name: that one, and in ROS 2 all that are in the enclave by
-    /// which the process is marked.
+    /// which the process is marked. Those that share their name with one of another process are not among them: what nodes have is known by their names.
     pub fn of_process(&self, node: &str) -> BTreeSet<String> {
-        let mark = crate::ros2::process::enclave_of(node);
-        let marked = mark.and_then(|mark| self.enclaves.get(&mark));
-        let marked = marked.into_iter().flatten().cloned();
-        marked.chain([node.to_owned()]).collect()
+        let marked = self.marked(node).into_iter().flatten();
+        let own = marked.filter(|other| *other == node || !self.is_shared(other));
+        own.cloned().chain([node.to_owned()]).collect()
     }
 
     /// Whether a node is one of that process.
     pub fn is_of_process(&self, node: &str, other: &str) -> bool {
-        let marked = || {
-            let mark = crate::ros2::process::enclave_of(node)?;
-            self.enclaves.get(&mark)
-        };
-        node == other || marked().is_some_and(|nodes| nodes.contains(other))
+        let marked = || self.marked(node);
+        node == other
+            || marked().is_some_and(|nodes| nodes.contains(other) && !self.is_shared(other))
+    }
+
+    /// Further nodes of that process which are not taken for its own, since another process has one of the same name.
+    pub fn shared_of_process(&self, node: &str) -> BTreeSet<String> {
+        let marked = self.marked(node).into_iter().flatten();
+        let shared = marked.filter(|other| *other != node && self.is_shared(other));
+        shared.cloned().collect()
+    }
+
+    fn marked(&self, node: &str) -> Option<&BTreeSet<String>> {
+        let mark = crate::ros2::process::enclave_of(node)?;
+        self.enclaves.get(&mark)
+    }
+
+    /// Whether nodes of several enclaves have this name.
+    fn is_shared(&self, node: &str) -> bool {
+        let with = self.enclaves.values().filter(|nodes| nodes.contains(node));
+        with.take(2).count() > 1
     }
 
     /// What these nodes have, as if they were one.
@@ -235,5 +250,35 @@ mod tests {
             Reliability::BestEffort
         );
         assert_eq!(all.services, [("/mouth/set".to_owned(), set)].into());
+    }
+    #[test]
+    fn a_further_node_whose_name_two_processes_have_is_of_neither() {
+        let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
+        let process = |node: &str, nodes: &[&str]| {
+            let mark = crate::ros2::process::enclave_of(node).expect("a mark");
+            (mark, named(nodes))
+        };
+        let graph = Graph {
+            enclaves: [
+                process("/left", &["/left", "/tenor", "/right", "/bass"]),
+                process("/right", &["/right", "/tenor"]),
+            ]
+            .into(),
+            ..Graph::default()
+        };
+        // The first node of a process is its own, whoever has taken its name.
+        assert_eq!(graph.of_process("/left"), named(&["/bass", "/left"]));
+        assert_eq!(graph.of_process("/right"), named(&["/right"]));
+        assert!(graph.is_of_process("/left", "/bass") && graph.is_of_process("/right", "/right"));
+        for (node, other) in [
+            ("/left", "/tenor"),
+            ("/right", "/tenor"),
+            ("/left", "/right"),
+        ] {
+            assert!(!graph.is_of_process(node, other), "{node} {other}");
+        }
+        let shared: BTreeSet<String> = named(&["/right", "/tenor"]);
+        assert_eq!(graph.shared_of_process("/left"), shared);
+        assert_eq!(graph.shared_of_process("/right"), named(&["/tenor"]));
     }
 }
