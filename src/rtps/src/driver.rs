@@ -5,7 +5,7 @@ mod tests;
 
 use std::io;
 use std::net::UdpSocket;
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -17,7 +17,7 @@ use rustix::time::{
 };
 use socket2::SockRef;
 use tokio::io::Interest;
-use tokio::io::unix::{AsyncFd, AsyncFdReadyGuard};
+use tokio::io::unix::AsyncFd;
 use tokio::sync::Notify;
 
 use crate::engine::{Datagram, Engine};
@@ -49,8 +49,8 @@ pub(crate) struct Core {
     stalled: Option<Datagram>,
 }
 
-/// A socket of which is told that something has come, and not that it has room: that would wake this process for each datagram that a
-/// receiver takes, just when the receiver answers it.
+/// A socket of which is told that something has come, and not that it has room: it would be told after each datagram that was sent, and a
+/// message would wake its participant's task once more.
 type Incoming = AsyncFd<UdpSocket>;
 
 /// What a participant, its ends and its task share.
@@ -205,12 +205,12 @@ impl Shared {
     }
 
     /// Takes what has come on a socket.
-    fn take(&self, mut ready: AsyncFdReadyGuard<'_, UdpSocket>, buffer: &mut Vec<u8>) {
+    fn take(&self, socket: &Incoming, buffer: &mut Vec<u8>) {
         let mut came = Vec::with_capacity(AT_ONCE);
         while came.len() < AT_ONCE {
             buffer.resize(LONGEST, 0);
-            let received = ready.try_io(|socket| socket.get_ref().recv_from(buffer));
-            let Ok(Ok((length, source))) = received else {
+            let received = socket.try_io(Interest::READABLE, |socket| socket.recv_from(buffer));
+            let Ok((length, source)) = received else {
                 break;
             };
             let datagram = if length <= COPIED {
@@ -309,14 +309,14 @@ pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
         }
         let multicast = async {
             match &shared.multicast {
-                Some(socket) => socket.readable().await,
+                Some(socket) => readable(socket).await,
                 None => std::future::pending().await,
             }
         };
         tokio::select! {
-            Ok(ready) = shared.user.readable() => shared.take(ready, &mut buffer),
-            Ok(ready) = shared.discovery.readable() => shared.take(ready, &mut buffer),
-            Ok(ready) = multicast => shared.take(ready, &mut buffer),
+            Ok(socket) = readable(&shared.user) => shared.take(socket, &mut buffer),
+            Ok(socket) = readable(&shared.discovery) => shared.take(socket, &mut buffer),
+            Ok(socket) = multicast => shared.take(socket, &mut buffer),
             Ok(mut ready) = timer.readable(), if matches!(waits, Waits::Receivers(_)) => {
                 let mut expirations = [0; 8];
                 let _ = rustix::io::read(timer.get_ref(), &mut expirations);
@@ -335,10 +335,16 @@ fn incoming(socket: UdpSocket) -> io::Result<Incoming> {
     Ok(unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }?)
 }
 
+/// Waits until something has come on a socket, which is then read until nothing is left.
+async fn readable(socket: &Incoming) -> io::Result<&Incoming> {
+    socket.readable().await?.retain_ready();
+    Ok(socket)
+}
+
 /// Waits until a socket has room for a datagram.
-async fn room(socket: &UdpSocket) {
+async fn room(socket: &impl AsFd) {
     let waited = async {
-        let same = socket.try_clone()?;
+        let same = socket.as_fd().try_clone_to_owned()?;
         // SAFETY: as with `incoming`.
         let same = unsafe { AsyncFd::register_with_interest(same, Interest::WRITABLE) }?;
         same.writable().await?.retain_ready();

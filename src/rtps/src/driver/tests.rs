@@ -1,6 +1,8 @@
 //! Whose process has ended is gone at once, where somebody says that one has.
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::os::unix::net::UnixDatagram;
+use std::task::Poll;
 
 use async_trait::async_trait;
 use socket2::{Domain, Protocol, Socket, Type};
@@ -36,6 +38,25 @@ const LONG: Duration = Duration::from_secs(60);
 /// A domain that no other test of this process uses; those of `tests/loopback.rs` are above.
 fn domain() -> u16 {
     (std::process::id() % 90) as u16
+}
+
+/// Between sockets of UDP on one machine there is always room: what a receiver does not take is lost.
+#[tokio::test]
+async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
+    let (sender, receiver) = UnixDatagram::pair().expect("two sockets");
+    sender.set_nonblocking(true).expect("it does not block");
+    let mut sent = 0;
+    while sender.send(&[0; 512]).is_ok() {
+        sent += 1;
+    }
+    let mut room = std::pin::pin!(room(&sender));
+    let at_once = std::future::poll_fn(|context| Poll::Ready(room.as_mut().poll(context)));
+    assert!(at_once.await.is_pending(), "there is none");
+    for _ in 0..sent {
+        receiver.recv(&mut [0; 512]).expect("a datagram");
+    }
+    timeout(LONG, room).await.expect("in time");
+    sender.send(&[0; 512]).expect("there is room");
 }
 
 async fn join() -> Participant {
