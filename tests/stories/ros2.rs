@@ -491,8 +491,9 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
         let id = servant["id"].as_str().context("an id")?;
         let left = std::fs::read(daemon.home.join(format!("servants/{id}/daemon.json")))?;
         let left: Value = serde_json::from_slice(&left)?;
-        let participants = left["participants"].as_array().context("a list")?;
-        Ok(participants.iter().map(Value::to_string).collect())
+        let earlier = left["earlier"].as_array().context("a list")?.iter();
+        let own = left["own"].as_object().context("by node")?.values();
+        Ok(earlier.chain(own).map(Value::to_string).collect())
     };
     let earlier = participants(&daemon)?;
     daemon.is_killed()?;

@@ -29,7 +29,7 @@ pub(crate) enum Transport {
 /// programs that answer each other are on one core or on two by chance, and a way then takes twice or half of what it took before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Host {
-    /// The first core.
+    /// The first core that this program may use.
     Robot,
     /// All others.
     Server,
@@ -38,11 +38,15 @@ pub(crate) enum Host {
 impl Host {
     /// As `taskset` takes them; none where there is only one.
     fn cores(self) -> Result<Option<String>> {
-        let count = std::thread::available_parallelism()?.get();
+        let allowed = nix::sched::sched_getaffinity(nix::unistd::Pid::from_raw(0))?;
+        let is_allowed = |core: &usize| allowed.is_set(*core).unwrap_or_default();
+        let mut cores = (0..nix::sched::CpuSet::count()).filter(is_allowed);
+        let first = cores.next().map(|core| core.to_string());
+        let others: Vec<String> = cores.map(|core| core.to_string()).collect();
         Ok(match self {
-            _ if count < 2 => None,
-            Self::Robot => Some("0".to_owned()),
-            Self::Server => Some(format!("1-{}", count - 1)),
+            _ if others.is_empty() => None,
+            Self::Robot => first,
+            Self::Server => Some(others.join(",")),
         })
     }
 }
