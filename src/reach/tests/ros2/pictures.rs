@@ -8,25 +8,28 @@ use tokio::time::timeout;
 
 use super::lab::{LONG, Lab};
 
-const PICTURES: usize = 30;
+/// A writer keeps 64 MiB for a reader that is slow, as one is on a busy machine; of the larger pictures that is so many.
+const AT_ONCE: usize = 10;
+const ROUNDS: usize = 3;
 
 #[tokio::test]
 async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
     let lab = Lab::new();
     let mut camera = lab.node("camera.py", &[]).await;
     let bus = lab.join("/cloudroid_bridge").await;
-    let qos = Qos::keep_last(PICTURES);
+    let qos = Qos::keep_last(AT_ONCE);
     let heard = bus.subscribe("/picture", WireType::any(), qos).await;
     let mut heard = heard.unwrap();
     let connected = timeout(LONG, reaches(heard.matched.clone(), 1)).await;
     connected.expect("a camera");
     let mut back = None;
-    for (width, height) in [(640, 480), (1920, 1080)] {
+    let sizes = [(640, 480), (1920, 1080)];
+    for (width, height) in sizes.into_iter().flat_map(|size| [size; ROUNDS]) {
         camera
-            .tell(&format!("show {width} {height} {PICTURES}"))
+            .tell(&format!("show {width} {height} {AT_ONCE}"))
             .await;
         let mut pictures: Vec<Message> = Vec::new();
-        while pictures.len() < PICTURES {
+        while pictures.len() < AT_ONCE {
             let next = timeout(LONG, heard.messages.recv()).await;
             pictures.push(next.expect("in time").expect("the bus is open"));
         }
@@ -35,7 +38,7 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
             let word = picture.bytes[4..8].try_into().expect("four bytes");
             u32::from_le_bytes(word) as usize
         };
-        assert!(pictures.iter().map(number).eq(0..PICTURES));
+        assert!(pictures.iter().map(number).eq(0..AT_ONCE));
         assert!(
             pictures
                 .iter()
@@ -55,7 +58,7 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
             clock.tick().await;
             publisher.publish(picture.bytes);
         }
-        let seen = camera.obey(&format!("count {PICTURES}")).await;
-        assert_eq!(seen, [json!((0..PICTURES).collect::<Vec<_>>())]);
+        let seen = camera.obey(&format!("count {AT_ONCE}")).await;
+        assert_eq!(seen, [json!((0..AT_ONCE).collect::<Vec<_>>())]);
     }
 }
