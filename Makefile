@@ -60,10 +60,16 @@ stub:
 .PHONY: stub-cross
 stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it under qemu (as root)
 	@scripts/deps run
-	@scripts/stub-cross "$(CACHE)" "$(CARGO_TARGET_DIR)/release" "$(CARGO_TARGET_DIR)/debug"
+	@scripts/stub-cross "$(CACHE)" stub "$(CARGO_TARGET_DIR)/release"
+
+# The same for stories: not optimised, and so within minutes.
+.PHONY: stub-cross-dev
+stub-cross-dev:
+	@scripts/deps run
+	@scripts/stub-cross "$(CACHE)" stub-test "$(CARGO_TARGET_DIR)/debug"
 
 .PHONY: test-cross
-test-cross: stub-cross build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
+test-cross: stub-cross-dev build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
 	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" cargo test $(DEV) --test stories -- cross::

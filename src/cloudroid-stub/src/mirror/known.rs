@@ -47,9 +47,10 @@ impl Known {
         let outputs = graph.outputs.iter().map(|output| &output.topic);
         let services = graph.services.iter().map(|service| &service.name);
         for name in inputs.chain(outputs).chain(services) {
-            if !is_below(name, own)
-                && let Some(other) = graph.nodes.keys().find(|node| is_below(name, node))
-            {
+            if is_below(name, own) {
+                continue;
+            }
+            if let Some(other) = graph.nodes.keys().find(|node| is_below(name, node)) {
                 self.of_others.insert(name.clone(), other.clone());
             }
         }
