@@ -136,3 +136,22 @@ fn rules_for_one_node_say_nothing_to_the_others() {
         assert_eq!(says_to_all(&argv), Naming { name, namespace }, "{line}");
     }
 }
+
+#[test]
+fn a_stub_is_called_by_the_only_node_of_its_program_that_is_told_no_name() {
+    let (plain, named) = ("see", "see --ros-args -r __node:=look");
+    for (lines, called_by) in [
+        (vec![plain], Some(plain)),
+        (vec![named], Some(named)),
+        (vec![named, plain], Some(plain)),
+        (vec![plain, named, named], Some(plain)),
+        // Which of them it is nobody can tell.
+        (vec![plain, plain], None),
+        (vec![named, named], None),
+        (vec![], None),
+    ] {
+        let nodes: Vec<_> = lines.iter().map(|line| words(line)).collect();
+        let found = named_by_program(nodes, |node| node).map(|node| node.join(" "));
+        assert_eq!(found.as_deref(), called_by, "{lines:?}");
+    }
+}
