@@ -321,12 +321,8 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
         scene.hears(number)?;
         scene.diagnosed(&mut diagnostics, "the cloud answers")?;
     }
-    scene.happened(&[
-        "local-takes-over",
-        "local-hands-back",
-        "local-takes-over",
-        "local-hands-back",
-    ])?;
+    let both = ["local-takes-over", "local-hands-back"];
+    scene.happened(&both.repeat(before + 2))?;
     // The history tells when it was so, and why.
     let history = scene
         .daemon
