@@ -72,7 +72,7 @@ stub-cross-dev:
 test-cross: stub-cross-dev build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
-	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" cargo test $(DEV) --test stories -- cross::
+	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" $(TELL) cross::
 
 # The daemon is compiled with the page that stands in web/dist. Nothing is done where web/ has not changed.
 .PHONY: web
@@ -88,9 +88,9 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 	@cargo build --locked --release -p cloudroidd -p cloudroidctl
 	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
-# One selection of packages for all that is built for tests: Cargo compiles a library once per set of features, and each selection
-# has a set of its own.
-DEV := --locked --workspace
+# One selection of packages and features for all that is built for tests: Cargo compiles a library once per set of features, and each selection
+# has a set of its own. Built with it are the lints, too (scripts/rustc), and the video codec, which no program of a release has.
+DEV := --locked --workspace --features codec/video
 
 # Puts what the daemon looks for beside a daemon that was built by profile $(1).
 define beside
@@ -101,7 +101,7 @@ endef
 
 .PHONY: build-dev
 build-dev: init web
-	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --bin eval --test stories
+	@cargo build $(DEV) --all-targets
 	$(call beside,debug)
 
 .PHONY: build-demo
@@ -128,14 +128,12 @@ room:
 	@scripts/room 30 15
 
 .PHONY: lint
-lint:
+lint: init web
 	@echo "== format"
 	@cargo fmt --all --check
-	@echo "== clippy, warnings denied"
-	@cargo clippy $(DEV) --all-targets -- -D warnings
-	@cargo clippy $(DEV) --features codec/video --test properties -- -D warnings
+	@echo "== compiler and clippy, warnings denied"
+	@scripts/lint $(DEV)
 	@echo "== types of the page"
-	@$(MAKE) web
 	@cd web && node node_modules/svelte-check/bin/svelte-check --fail-on-warnings --output human
 	@echo "== licences and sources of dependencies"
 	@scripts/python "$(AUDIT)" scripts/audit.txt
@@ -152,9 +150,12 @@ SEED ?= 1
 .PHONY: unit
 unit: build-dev ## the crates' own tests; SEED=n for other random cases than the usual
 	@echo "== unit tests"
-	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --exclude stories
-	@echo "== unit tests of the feature video"
-	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --features codec/video --test properties --test replay -- video the_corpus
+	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --all-targets
+	@echo "== the codec without video"
+	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties -- a_build_without_video
+
+# The stories are a test target of Cargo's that says so and ends where it is run with all others.
+TELL := CLOUDROID_STORIES=1 cargo test $(DEV) --test stories --
 
 .PHONY: robots
 robots:
@@ -164,19 +165,18 @@ robots:
 .PHONY: stories
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
-	@cargo test $(DEV) --test stories -- $(ONLY)
+	@$(TELL) $(ONLY)
 
 .PHONY: test-web
 test-web: build-dev ## the page in a real browser, against a real daemon; screenshots are below target/web
 	@scripts/node "$(WEB_TEST)" tests/web/package.json
 	@echo "== the page in Chromium"
-	@cargo test $(DEV) --test stories -- page::
+	@$(TELL) page::
 
 .PHONY: test-vm
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
 	@scripts/deps build run vm
 	@echo "== stories in a virtual machine"
-	@cargo test $(DEV) -q --test vm --no-run
 	@tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
 
 .PHONY: bench

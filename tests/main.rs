@@ -1,14 +1,12 @@
 //! The whole system, told as stories: each a user's errand from end to end with real parts. Run by
 //! `make stories`, as root.
 
-use std::num::NonZero;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
 
-use libtest_mimic::{Arguments, Trial};
-use parking_lot::{Mutex, RwLock};
 use ros::bus::RosVersion;
 use support::Verdict;
+
+use runner::Story;
 
 #[path = "stories/access.rs"]
 mod access;
@@ -112,18 +110,22 @@ mod readiness;
 mod recordings;
 #[path = "stories/refusals.rs"]
 mod refusals;
+mod rehearsal;
 #[path = "stories/robot_network.rs"]
 mod robot_network;
 #[path = "stories/rollouts.rs"]
 mod rollouts;
 #[path = "stories/ros2.rs"]
 mod ros2;
+mod runner;
 #[path = "stories/shadowing.rs"]
 mod shadowing;
 #[path = "stories/sharing.rs"]
 mod sharing;
 #[path = "stories/survival.rs"]
 mod survival;
+#[path = "stories/telling.rs"]
+mod telling;
 #[path = "stories/terms.rs"]
 mod terms;
 #[path = "stories/tls.rs"]
@@ -140,8 +142,9 @@ mod viewers;
 mod warm_pool;
 
 /// A story under its function's name.
-fn story(name: &'static str, tell: fn() -> Verdict) -> Trial {
-    told(name, tell)
+fn story(name: &'static str, tell: fn() -> Verdict) -> Story {
+    let tell = Box::new(tell);
+    Story { name, tell }
 }
 
 /// Names functions once.
@@ -155,15 +158,16 @@ macro_rules! stories {
 macro_rules! of_both {
     ($module:ident: $($name:ident),+ $(,)?) => {
         vec![$(
-            of(RosVersion::One, concat!(stringify!($module), "::", stringify!($name)), $module::$name),
-            of(RosVersion::Two, concat!(stringify!($module), "::ros2::", stringify!($name)), $module::$name),
+            story_of(RosVersion::One, concat!(stringify!($module), "::", stringify!($name)), $module::$name),
+            story_of(RosVersion::Two, concat!(stringify!($module), "::ros2::", stringify!($name)), $module::$name),
         )+]
     };
 }
 
-/// A story that is told of a robot of this ROS.
-fn of(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) -> Trial {
-    told(name, move || tell(version))
+/// A story of a robot of this ROS.
+fn story_of(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) -> Story {
+    let tell = Box::new(move || tell(version));
+    Story { name, tell }
 }
 
 /// Stories that compare times with each other: told while no other is.
@@ -171,57 +175,15 @@ const ALONE: [&str; 2] = [
     "calibration::fewer_cores_take_longer_and_rows_say_how_long",
     "page::a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing",
 ];
-static TELLING: RwLock<()> = RwLock::new(());
-
-/// How long each story took: who makes the tests faster begins with the longest.
-static TOOK: Mutex<Vec<(Duration, &str)>> = Mutex::new(Vec::new());
-/// Of which the longest are printed.
-const LONGEST: usize = 20;
-/// Why stories failed.
-static FAILED: Mutex<Vec<(&str, String)>> = Mutex::new(Vec::new());
-/// Of each reason so many characters are printed, from its beginning.
-const REASON: usize = 2000;
-
-fn told(name: &'static str, tell: impl FnOnce() -> Verdict + Send + 'static) -> Trial {
-    Trial::test(name, move || {
-        let alone = ALONE.contains(&name).then(|| TELLING.write());
-        let beside = alone.is_none().then(|| TELLING.read());
-        let began = Instant::now();
-        let verdict = tell();
-        drop((alone, beside));
-        TOOK.lock().push((began.elapsed(), name));
-        verdict.map_err(|error| {
-            let reason = format!("{error:#}");
-            FAILED.lock().push((name, reason.clone()));
-            reason.into()
-        })
-    })
-}
-
-fn print_longest() {
-    let mut took = TOOK.lock();
-    took.sort_unstable_by(|one, other| other.cmp(one));
-    println!("== the longest stories, in seconds");
-    for (time, name) in took.iter().take(LONGEST) {
-        println!("{:8.1}  {name}", time.as_secs_f64());
-    }
-}
-
-/// Says last which stories failed and why: of a long record the end is what is looked at, or kept.
-fn print_failed() {
-    for (name, reason) in FAILED.lock().iter() {
-        let shown: String = reason.chars().take(REASON).collect();
-        println!("== failed: {name}\n{shown}");
-    }
-}
-
-/// Stories told at a time for each core: most of a story is waiting.
-const AT_A_TIME: usize = 2;
 
 fn main() -> ExitCode {
-    let mut arguments = Arguments::from_args();
-    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
-    arguments.test_threads.get_or_insert(AT_A_TIME * cores);
+    if std::env::var_os("CLOUDROID_STORIES").is_none() {
+        println!("stories are told by make stories, with what they need");
+        return ExitCode::SUCCESS;
+    }
+    if std::env::var_os(rehearsal::VARIABLE).is_some() {
+        return runner::run(rehearsal::stories(), &[]);
+    }
     // Their programs take minutes to build: make test-cross does, and says so.
     let built = std::env::var("CLOUDROID_CROSS").unwrap_or_default();
     let has = |architecture: &str| built.split_whitespace().any(|one| one == architecture);
@@ -232,7 +194,7 @@ fn main() -> ExitCode {
     if has("armv7") {
         cross.extend(stories![cross: an_armv7_robot_works]);
     }
-    let trials: Vec<Trial> = [
+    let stories: Vec<Story> = [
         cross,
         stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
         stories![burglary:
@@ -600,6 +562,12 @@ fn main() -> ExitCode {
             a_certificate_is_read_again_when_it_changes,
             clients_of_a_named_proxy_are_told_apart,
         ],
+        stories![telling:
+            one_that_fails_once_is_told_again_and_its_world_is_kept,
+            more_than_two_by_chance_fail_the_run_and_strictly_the_first,
+            what_the_machine_lacks_is_said_in_a_line,
+            what_a_killed_run_left_is_removed_by_the_next_and_a_living_one_is_left_alone,
+        ],
         stories![trying:
             a_packaged_node_is_tried_on_a_picture,
             a_source_package_is_tried_on_a_recording,
@@ -624,18 +592,5 @@ fn main() -> ExitCode {
     .into_iter()
     .flatten()
     .collect();
-    let conclusion = libtest_mimic::run(&arguments, trials);
-    if !arguments.list {
-        print_longest();
-        print_failed();
-    }
-    let left = support::world::end();
-    for thing in &left {
-        eprintln!("left behind: {thing}");
-    }
-    if conclusion.has_failed() || !left.is_empty() {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    }
+    runner::run(stories, &ALONE)
 }

@@ -29,7 +29,7 @@ fn line(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
 
 /// A robot's directory, and what is typed there.
 struct Robot {
-    own: tempfile::TempDir,
+    own: support::world::Directory,
 }
 
 impl Robot {

@@ -5,16 +5,15 @@ use std::process::{Child, Command, Stdio};
 
 use anyhow::Context;
 use serde_json::json;
-use tempfile::TempDir;
 
 use crate::deployer::run;
 use crate::machine::free_port;
 use crate::tls::make_certificates;
-use crate::world::world;
+use crate::world::{self, world};
 
 /// Where the authority is asked, whoever runs there.
 pub struct Directory {
-    place: TempDir,
+    place: world::Directory,
     port: u16,
     management: u16,
 }

@@ -69,3 +69,17 @@ pub fn web_modules() -> PathBuf {
         .map(PathBuf::from)
         .expect("CLOUDROID_WEB_MODULES names Node's packages; run the stories by make stories or make test-web")
 }
+
+/// Where what is made once for all checkouts is kept.
+pub fn cache() -> PathBuf {
+    let caches = std::env::var_os("XDG_CACHE_HOME").map(PathBuf::from);
+    let home = || PathBuf::from(std::env::var_os("HOME").unwrap_or_else(|| "/root".into()));
+    caches
+        .unwrap_or_else(|| home().join(".cache"))
+        .join("cloudroid")
+}
+
+/// Where what is found out in this checkout is kept: its `target`, or, for runs that are themselves tested, where `CLOUDROID_TARGET` says.
+pub fn target() -> PathBuf {
+    std::env::var_os("CLOUDROID_TARGET").map_or_else(|| checkout().join("target"), PathBuf::from)
+}

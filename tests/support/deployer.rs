@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, ensure};
 use serde_json::Value;
 
-use crate::binaries;
+use crate::{binaries, cores};
 
 /// Types commands to one daemon.
 #[derive(Debug, Clone)]
@@ -75,6 +75,11 @@ impl Deployer {
     /// Types `cloudroidctl ARGUMENTS`.
     pub fn types<S: AsRef<str>>(&self, arguments: &[S]) -> anyhow::Result<Outcome> {
         let arguments: Vec<&str> = arguments.iter().map(AsRef::as_ref).collect();
+        // What unpacks, compiles or packs keeps a core busy.
+        let is_work = arguments
+            .iter()
+            .any(|word| ["push", "import"].contains(word));
+        let _core = is_work.then(cores::acquire);
         run(Command::new(binaries::path("cloudroidctl"))
             .args(&arguments)
             .env("CLOUDROID_HOME", &self.home)

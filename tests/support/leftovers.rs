@@ -3,34 +3,61 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use nix::mount::{MntFlags, umount2};
+
 use crate::procfs;
 
-/// Processes, mounts and cgroups that refer to `home`. Empty when all is clean.
+/// Describes processes and mounts that refer to what is in `home`. Empty when all is clean.
 pub fn of(home: &Path) -> Vec<String> {
-    let home = home.to_string_lossy().into_owned();
-    let mut found = Vec::new();
-    for pid in procfs::pids() {
-        if pid == std::process::id() as i32 {
-            continue;
-        }
-        let command = procfs::command_line(pid).unwrap_or_default();
-        let directory = fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
-        let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
-        if command.contains(&home)
-            || directory.starts_with(&home)
-            || mounted.contains(&format!("{home}/"))
-        {
-            found.push(format!("process {pid}: {command}"));
-        }
-    }
-    let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
+    let mut found: Vec<String> = processes_of(home)
+        .into_iter()
+        .map(|pid| {
+            let command = procfs::command_line(pid).unwrap_or_default();
+            format!("process {pid}: {command}")
+        })
+        .collect();
     found.extend(
-        mounts
-            .lines()
-            .filter(|line| line.contains(&home))
-            .map(|line| format!("mount {line}")),
+        mounts_below(home)
+            .iter()
+            .map(|mount| format!("mount {}", mount.display())),
     );
     found
+}
+
+/// Processes that were started with a path of `home`, work in it, or have something below it mounted.
+pub fn processes_of(home: &Path) -> Vec<i32> {
+    let own = std::process::id() as i32;
+    let home = home.to_string_lossy().into_owned();
+    let refers = |pid: &i32| {
+        let command = procfs::command_line(*pid).unwrap_or_default();
+        let directory = fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
+        let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
+        command.contains(&home)
+            || directory.starts_with(&home)
+            || mounted.contains(&format!("{home}/"))
+    };
+    procfs::pids()
+        .into_iter()
+        .filter(|pid| *pid != own)
+        .filter(refers)
+        .collect()
+}
+
+/// Detaches what is mounted below a directory in this mount namespace, the innermost first.
+pub fn unmount_below(directory: &Path) {
+    for mount in mounts_below(directory).iter().rev() {
+        let _ = umount2(mount, MntFlags::MNT_DETACH);
+    }
+}
+
+/// Mount points below `home` in this mount namespace, in the order in which they were mounted (proc(5), field 5 of `mountinfo`).
+fn mounts_below(home: &Path) -> Vec<PathBuf> {
+    let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
+    mounts
+        .lines()
+        .filter_map(|line| Some(PathBuf::from(line.split(' ').nth(4)?)))
+        .filter(|mount| mount.starts_with(home) && mount != home)
+        .collect()
 }
 
 /// Cgroup directories whose name says that they are a servant's.

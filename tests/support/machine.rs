@@ -7,12 +7,11 @@ use std::process::Command;
 
 use anyhow::{Context, ensure};
 use nix::fcntl::{Flock, FlockArg};
-use tempfile::TempDir;
 
 use crate::binaries;
 use crate::daemon::Daemon;
 use crate::deployer::{Outcome, path_str, run};
-use crate::world::world;
+use crate::world::{Directory, world};
 
 /// What robots have: the tools that find and start nodes, three shells, a package with its original nodes, and what
 /// makes a network with names.
@@ -43,7 +42,7 @@ const SUITE: &str = "bookworm";
 /// A robot's computer.
 pub struct Machine {
     base: PathBuf,
-    own: TempDir,
+    own: Directory,
 }
 
 impl Machine {

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::PathBuf;
 
 /// The fields of `/proc/PID/status`; none when the process is gone.
 pub fn status(pid: i32) -> Option<BTreeMap<String, String>> {
@@ -44,4 +45,54 @@ pub fn namespace(pid: i32, kind: &str) -> Option<String> {
             .to_string_lossy()
             .into_owned(),
     )
+}
+
+/// Tells if a process is there and has not ended: one that nobody has reaped yet has.
+pub fn is_running(pid: i32) -> bool {
+    let state = status(pid).and_then(|status| status.get("State").cloned());
+    state.is_some_and(|state| !state.starts_with(['Z', 'X']))
+}
+
+/// Directories of a process's cgroups, in the hierarchies as hybrid hosts mount them.
+pub fn cgroups(pid: i32) -> Vec<PathBuf> {
+    let text = fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
+    text.lines()
+        .filter_map(|line| {
+            let mut fields = line.splitn(3, ':').skip(1);
+            let (controllers, path) = (fields.next()?, fields.next()?);
+            let hierarchy = if controllers.is_empty() {
+                "unified"
+            } else {
+                controllers.trim_start_matches("name=")
+            };
+            let hierarchy = PathBuf::from("/sys/fs/cgroup").join(hierarchy);
+            let root = if hierarchy.exists() {
+                hierarchy
+            } else {
+                PathBuf::from("/sys/fs/cgroup")
+            };
+            Some(root.join(path.trim_start_matches('/')))
+        })
+        .collect()
+}
+
+/// These processes with their children, the children's children, and so on.
+pub fn with_descendants(pids: &[i32]) -> Vec<i32> {
+    let parents: Vec<(i32, i32)> = self::pids()
+        .into_iter()
+        .filter_map(|pid| Some((pid, status(pid)?.get("PPid")?.parse().ok()?)))
+        .collect();
+    let mut all = pids.to_vec();
+    let mut next = 0;
+    while next < all.len() {
+        let parent = all[next];
+        let children = parents.iter().filter(|(_, of)| *of == parent);
+        let new: Vec<i32> = children
+            .map(|(pid, _)| *pid)
+            .filter(|pid| !all.contains(pid))
+            .collect();
+        all.extend(new);
+        next += 1;
+    }
+    all
 }

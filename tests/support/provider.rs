@@ -7,13 +7,12 @@ use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
-use tempfile::TempDir;
 
 use crate::binaries;
 use crate::daemon::{Daemon, Setup};
 use crate::deployer::{path_str, run};
 use crate::machine::free_port;
-use crate::world::world;
+use crate::world::{Directory, world};
 
 /// What it shares with the daemon.
 pub const SECRET: &str = "forty-two-white-elephants-in-a-row";
@@ -28,7 +27,7 @@ pub struct Provider {
     daemon: u16,
     /// Where the portal answers.
     portal: String,
-    place: TempDir,
+    place: Directory,
     running: Option<Child>,
     /// Which key it signs by.
     key: u32,
@@ -67,7 +66,7 @@ impl Provider {
             port: free_port()?,
             portal: format!("http://127.0.0.1:{daemon}"),
             daemon,
-            place: tempfile::tempdir()?,
+            place: Directory::new("provider")?,
             running: None,
             key: 1,
             claims_in: "userinfo",

@@ -18,7 +18,6 @@ use ros::bus::{
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::schema::MessageType;
-use tempfile::TempDir;
 use tokio::runtime::Runtime;
 
 use crate::binaries;
@@ -27,6 +26,7 @@ use crate::daemon::Daemon;
 use crate::deployer::path_str;
 use crate::robot::PATIENCE;
 use crate::ros_system::{Domain, Node, RosSystem};
+use crate::world::Directory;
 
 /// A robot.
 pub struct Site {
@@ -36,7 +36,7 @@ pub struct Site {
     pub system: RosSystem,
     /// Where its processes run, if not in this machine's own network.
     namespace: Option<PathBuf>,
-    place: TempDir,
+    place: Directory,
 }
 
 /// A node that runs as a process: a stub, or an original.
@@ -69,9 +69,7 @@ impl Site {
             .worker_threads(1)
             .enable_all()
             .build()?;
-        let place = tempfile::Builder::new()
-            .prefix("cloudroid-site-")
-            .tempdir()?;
+        let place = Directory::new("site")?;
         Ok(Self {
             system: system(&runtime)?,
             runtime,

@@ -4,17 +4,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use anyhow::ensure;
-use tempfile::TempDir;
 
 use crate::deployer::run;
 use crate::machine::free_port;
-use crate::world::world;
+use crate::world::{Directory, world};
 
 /// Both, made by openssl and socat.
 pub struct Proxy {
     /// Where it listens.
     pub port: u16,
-    place: TempDir,
+    place: Directory,
     serving: Child,
 }
 

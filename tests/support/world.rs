@@ -2,26 +2,70 @@
 //! needs them. A robot's servant is its own, so stories that only use services do not meet.
 
 use std::collections::{HashMap, HashSet};
-use std::path::PathBuf;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-use tempfile::TempDir;
+use anyhow::Context;
+use nix::mount::{MntFlags, umount2};
 
 use crate::daemon::{Daemon, Setup};
-use crate::leftovers;
+use crate::{claim, leftovers, story};
 
-/// Set once a push has come to its end.
-type Pushed = Arc<OnceLock<Result<(), String>>>;
+/// True once a service is there; the lock is held while it is pushed.
+type Pushed = Arc<Mutex<bool>>;
 
 static WORLD: OnceLock<World> = OnceLock::new();
 
+/// The names of runs' places begin with this, in the directory for temporary files.
+pub const PREFIX: &str = "cloudroid-stories-";
+
 /// The stories' place on this machine.
 pub struct World {
-    place: TempDir,
+    place: PathBuf,
     shared: Mutex<Option<Arc<Daemon>>>,
     services: Mutex<HashMap<&'static str, Pushed>>,
-    /// Names of homes that were given.
-    homes: Mutex<HashSet<String>>,
+    /// Homes that were given.
+    homes: Mutex<HashSet<PathBuf>>,
+}
+
+/// A directory of a story. It is there until the story has ended, and kept where that failed.
+#[derive(Debug)]
+pub struct Directory {
+    path: PathBuf,
+    of_story: bool,
+}
+
+impl Directory {
+    fn new_in(parent: &Path, name: &str) -> anyhow::Result<Directory> {
+        let prefix = format!("{name}-");
+        let path = tempfile::Builder::new()
+            .prefix(&prefix)
+            .tempdir_in(parent)?
+            .keep();
+        let of_story = story::add_directory(&path);
+        Ok(Directory { path, of_story })
+    }
+
+    /// A new, empty directory: in this run's place, or, in programs that tell no stories, among temporary files.
+    pub fn new(name: &str) -> anyhow::Result<Directory> {
+        match WORLD.get() {
+            Some(world) => world.directory(name),
+            None => Directory::new_in(&std::env::temp_dir(), &format!("cloudroid-{name}")),
+        }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl Drop for Directory {
+    fn drop(&mut self) {
+        if !self.of_story {
+            let _ = std::fs::remove_dir_all(&self.path);
+        }
+    }
 }
 
 /// A service of the shared daemon.
@@ -33,6 +77,21 @@ pub struct Service {
     pub package: Option<&'static str>,
     /// More arguments of the push.
     pub arguments: &'static [&'static str],
+}
+
+impl Service {
+    /// Pushes it.
+    ///
+    /// # Errors
+    /// With what the push said.
+    pub fn push_to(self, daemon: &Daemon) -> anyhow::Result<()> {
+        let deployer = daemon.deployer();
+        let outcome = match self.package {
+            Some(package) => deployer.pushes(package, self.arguments),
+            None => deployer.types(&[&["push"], self.arguments].concat()),
+        };
+        outcome?.succeeded().map(drop)
+    }
 }
 
 /// Debian's `people_detect`.
@@ -153,82 +212,84 @@ pub const FIXTURE: Service = Service {
 /// The world of this run.
 pub fn world() -> &'static World {
     WORLD.get_or_init(|| {
-        assert!(
-            nix::unistd::geteuid().is_root(),
-            "the stories start servants, which needs root: sudo make test"
-        );
-        World {
-            place: tempfile::Builder::new()
-                .prefix("cloudroid-stories-")
-                .tempdir()
-                .expect("a temporary directory"),
-            shared: Mutex::new(None),
-            services: Mutex::default(),
-            homes: Mutex::default(),
-        }
+        World::new().unwrap_or_else(|error| panic!("the stories have no place: {error:#}"))
     })
 }
 
 impl World {
-    /// A new, empty home.
+    fn new() -> anyhow::Result<World> {
+        let place = tempfile::Builder::new().prefix(PREFIX).tempdir()?.keep();
+        claim::claim(&place).with_context(|| place.display().to_string())?;
+        Ok(World {
+            place,
+            shared: Mutex::new(None),
+            services: Mutex::default(),
+            homes: Mutex::default(),
+        })
+    }
+
+    /// The directory that everything of this run is in.
+    pub fn place(&self) -> &Path {
+        &self.place
+    }
+
+    /// A new, empty home. A story that is told again has another one.
     pub fn home(&self, name: &str) -> PathBuf {
-        self.place.path().join(name)
+        let again = if story::is_told_again() { "-again" } else { "" };
+        let home = self.place.join(format!("{name}{again}"));
+        story::add_home(&home);
+        home
     }
 
     /// A new, empty directory, gone with its story.
-    pub fn directory(&self, name: &str) -> anyhow::Result<TempDir> {
-        Ok(tempfile::Builder::new()
-            .prefix(&format!("{name}-"))
-            .tempdir_in(self.place.path())?)
+    pub fn directory(&self, name: &str) -> anyhow::Result<Directory> {
+        Directory::new_in(&self.place, name)
     }
 
     /// A daemon of one's own, in a home that no other story has.
     pub fn own(&self, name: &str) -> Setup {
-        let mut homes = self
-            .homes
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner);
-        assert!(homes.insert(name.to_owned()), "two stories have {name}");
-        Setup::new(&self.home(name))
+        let home = self.home(name);
+        let mut homes = self.homes.lock().unwrap_or_else(PoisonError::into_inner);
+        assert!(homes.insert(home.clone()), "two stories have {name}");
+        Setup::new(&home)
+    }
+
+    /// The daemon that most stories use, if there is one yet.
+    pub fn shared_daemon(&self) -> Option<Arc<Daemon>> {
+        let shared = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        shared.clone()
     }
 
     /// The daemon that most stories use.
     pub fn shared(&self) -> anyhow::Result<Arc<Daemon>> {
-        let mut shared = self
-            .shared
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut shared = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(daemon) = &*shared {
             return Ok(daemon.clone());
         }
-        let daemon = Arc::new(self.own("shared").start()?);
+        // Of the run, not of the story that happens to be first.
+        let daemon = Arc::new(Setup::new(&self.place.join("shared")).start()?);
         *shared = Some(daemon.clone());
         Ok(daemon)
     }
 
-    /// The shared daemon, once it has this service: pushed by the first story that asks.
+    /// The shared daemon, once it has this service: pushed by the first story that asks. Where that fails, the next one tries again.
     pub fn with(&self, service: Service) -> anyhow::Result<Arc<Daemon>> {
         let daemon = self.shared()?;
-        let once = self
+        let pushed = self
             .services
             .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .unwrap_or_else(PoisonError::into_inner)
             .entry(service.name)
             .or_default()
             .clone();
-        once.get_or_init(|| {
-            let deployer = daemon.deployer();
-            let pushed = match service.package {
-                Some(package) => deployer.pushes(package, service.arguments),
-                None => deployer.types(&[&["push"], service.arguments].concat()),
-            };
-            pushed
-                .and_then(|outcome| outcome.succeeded())
-                .map(|_| ())
-                .map_err(|error| format!("{error:#}"))
-        })
-        .clone()
-        .map_err(|error| anyhow::anyhow!("{} could not be pushed: {error}", service.name))?;
+        let mut is_pushed = pushed.lock().unwrap_or_else(PoisonError::into_inner);
+        if !*is_pushed {
+            service
+                .push_to(&daemon)
+                .with_context(|| format!("{} could not be pushed", service.name))?;
+            *is_pushed = true;
+        }
+        drop(is_pushed);
         Ok(daemon)
     }
 }
@@ -241,7 +302,7 @@ pub fn end() -> Vec<String> {
     let daemon = world
         .shared
         .lock()
-        .unwrap_or_else(std::sync::PoisonError::into_inner)
+        .unwrap_or_else(PoisonError::into_inner)
         .take();
     let mut left = Vec::new();
     let mut servants = Vec::new();
@@ -258,14 +319,16 @@ pub fn end() -> Vec<String> {
             Err(_) => left.push("the shared daemon is still in use".to_owned()),
         }
     }
-    left.extend(leftovers::of(world.place.path()));
+    left.extend(leftovers::of(&world.place));
     left.extend(
         leftovers::cgroups(&servants)
             .into_iter()
             .map(|path| format!("cgroup {}", path.display())),
     );
     if left.is_empty() {
-        let _ = std::fs::remove_dir_all(world.place.path());
+        // The run's disk, where it has one: what is on it goes with it.
+        let _ = umount2(&world.place, MntFlags::MNT_DETACH);
+        let _ = std::fs::remove_dir_all(&world.place);
     }
     left
 }

@@ -1,7 +1,7 @@
 //! What every bench reports: a figure, the floor or peer it was measured beside in the same run, and what was to be
 //! reached.
 //!
-//! ```no_run
+//! ```text
 //! use bench_report::{Race, Report, Target};
 //!
 //! # fn ours() {} fn theirs() {}

@@ -1,0 +1,113 @@
+//! What the stories need of the machine. What is missing is told in one line, with what follows from it.
+
+use std::path::Path;
+
+use nix::mount::{MsFlags, mount, umount};
+
+use support::world::{self, world};
+use support::{binaries, claim, disk, procfs};
+
+/// Without a disk of their own, homes take this many bytes of that for temporary files.
+const ROOM: u64 = 12 << 30;
+
+/// Checks the machine, removes what killed runs have left, and gives this run a disk. To be called before this process has threads.
+///
+/// # Errors
+/// Tells what is missing, and what to do.
+pub(super) fn prepare() -> Result<(), String> {
+    if !nix::unistd::geteuid().is_root() {
+        return Err("servants are started by root: sudo make stories".to_owned());
+    }
+    check_cgroups()?;
+    for place in claim::find_abandoned(&std::env::temp_dir(), world::PREFIX) {
+        match claim::remove_abandoned(&place) {
+            Ok(()) => println!(
+                "removed {}, which a run that was killed had left",
+                place.display()
+            ),
+            Err(error) => println!(
+                "{} stays, which a run that was killed had left: {error:#}",
+                place.display()
+            ),
+        }
+    }
+    let place = world().place();
+    if let Err(error) = disk::mount_on(place, &binaries::cache()) {
+        println!(
+            "no disk of their own for the stories' homes, which then are on that of {} and take longer: {error:#}",
+            place.display()
+        );
+        check_room(place)?;
+    }
+    check_overlay(place)
+}
+
+/// A servant has a cgroup below the daemon's, with limits.
+fn check_cgroups() -> Result<(), String> {
+    let mut is_there = false;
+    for parent in procfs::cgroups(std::process::id() as i32) {
+        let has_limits = ["cpu.shares", "memory.limit_in_bytes", "cgroup.controllers"];
+        if !has_limits.iter().any(|file| parent.join(file).exists()) {
+            continue;
+        }
+        is_there = true;
+        let child = parent.join(format!("cloudroid-check-{}", std::process::id()));
+        std::fs::create_dir(&child).map_err(|error| {
+            format!("cgroups cannot be made below {} ({error}), and servants have limits: run the stories where root may make them", parent.display())
+        })?;
+        let _ = std::fs::remove_dir(child);
+    }
+    if is_there {
+        return Ok(());
+    }
+    Err("no cgroups with limits are mounted below /sys/fs/cgroup, and servants have limits: mount them, or run the stories elsewhere".to_owned())
+}
+
+fn check_room(place: &Path) -> Result<(), String> {
+    let free = disk::free_bytes(place).map_err(|error| format!("{error:#}"))?;
+    if free < ROOM {
+        let (free, room) = (free >> 30, ROOM >> 30);
+        return Err(format!(
+            "{} has {free} GB free, and homes take {room} GB: make room there, or name another place by TMPDIR",
+            place.display()
+        ));
+    }
+    Ok(())
+}
+
+/// A servant's files are layers over each other, which an overlay of overlays, for example, cannot hold.
+fn check_overlay(place: &Path) -> Result<(), String> {
+    let trial = place.join("overlay");
+    let names = ["lower", "upper", "work", "root"];
+    let made = names
+        .iter()
+        .try_for_each(|name| std::fs::create_dir_all(trial.join(name)));
+    made.map_err(|error| format!("{}: {error}", trial.display()))?;
+    let at = |name: &str| trial.join(name).display().to_string();
+    let options = format!(
+        "lowerdir={},upperdir={},workdir={}",
+        at("lower"),
+        at("upper"),
+        at("work")
+    );
+    // Some file systems are refused only when something is renamed or removed there.
+    let used = mount(
+        Some("overlay"),
+        trial.join("root").as_path(),
+        Some("overlay"),
+        MsFlags::empty(),
+        Some(options.as_str()),
+    )
+    .map_err(std::io::Error::from)
+    .and_then(|()| {
+        let used = std::fs::write(trial.join("root/file"), "")
+            .and_then(|()| std::fs::remove_file(trial.join("root/file")));
+        umount(&trial.join("root"))
+            .map_err(std::io::Error::from)
+            .and(used)
+    });
+    let _ = std::fs::remove_dir_all(&trial);
+    used.map_err(|error| {
+        format!("the file system of {} cannot hold the upper directories of overlays ({error}), which servants are made of: name another place by TMPDIR", place.display())
+    })
+}

@@ -1,0 +1,134 @@
+//! What is printed at the end of a run, and what it comes to.
+
+use std::io::Write;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde_json::json;
+use support::binaries;
+
+use super::{MOST_FLAKY, Outcome, Story, evidence_of};
+
+/// The longest stories are printed: who makes the tests faster begins with them.
+const LONGEST: usize = 20;
+/// How many characters of a reason are printed.
+const REASON: usize = 2000;
+
+/// A run's end.
+pub(super) struct Report {
+    told: Vec<Outcome>,
+    not_told: usize,
+    /// Stories that failed and then passed, with the first reason.
+    flaky: Vec<(&'static str, String)>,
+    /// Stories that failed for good, with the last reason.
+    failed: Vec<(&'static str, String)>,
+    left: Vec<String>,
+    is_strict: bool,
+}
+
+impl Report {
+    pub(super) fn new(
+        stories: &[Story],
+        told: Vec<Outcome>,
+        again: Vec<Outcome>,
+        left: Vec<String>,
+        is_strict: bool,
+    ) -> Report {
+        let mut report = Report {
+            not_told: stories.len() - told.len(),
+            flaky: Vec::new(),
+            failed: Vec::new(),
+            told: Vec::new(),
+            left,
+            is_strict,
+        };
+        for outcome in &told {
+            let Some(reason) = &outcome.failure else {
+                continue;
+            };
+            let second = again.iter().find(|second| second.name == outcome.name);
+            match second.map(|second| &second.failure) {
+                Some(None) => report.flaky.push((outcome.name, reason.clone())),
+                Some(Some(reason)) => report.failed.push((outcome.name, reason.clone())),
+                None => report.failed.push((outcome.name, reason.clone())),
+            }
+        }
+        report.told = told;
+        report
+    }
+
+    /// Tells if the run is green.
+    pub(super) fn is_good(&self) -> bool {
+        self.failed.is_empty()
+            && self.left.is_empty()
+            && self.not_told == 0
+            && self.flaky.len() <= MOST_FLAKY
+            && (!self.is_strict || self.flaky.is_empty())
+    }
+
+    /// Prints it, what matters last: of a long record the end is what is looked at, or kept.
+    pub(super) fn print(&self) {
+        let mut longest: Vec<&Outcome> = self.told.iter().collect();
+        longest.sort_by_key(|outcome| std::cmp::Reverse(outcome.took));
+        println!("== the longest stories, in seconds, and how long of that they waited for a core");
+        for outcome in longest.iter().take(LONGEST) {
+            println!(
+                "{:8.1} {:7.1}  {}",
+                outcome.took.as_secs_f64(),
+                outcome.waited.as_secs_f64(),
+                outcome.name
+            );
+        }
+        let all: Duration = self.told.iter().map(|outcome| outcome.took).sum();
+        println!("== {:.0} s of stories in all", all.as_secs_f64());
+        for (name, reason) in &self.flaky {
+            println!("FLAKY {name}: {}", shorten(reason));
+            println!("      kept below {}", evidence_of(name, 1).display());
+            note_flaky(name, reason);
+        }
+        if self.flaky.len() > MOST_FLAKY {
+            println!("more than {MOST_FLAKY} stories failed and then passed: the run has failed");
+        }
+        for (name, reason) in &self.failed {
+            println!(
+                "== failed: {name}\n{}\nkept below {}",
+                shorten(reason),
+                evidence_of(name, 1).display()
+            );
+        }
+        for thing in &self.left {
+            println!("left behind: {thing}");
+        }
+        if self.not_told > 0 {
+            println!(
+                "{} stories were not told after the first failure",
+                self.not_told
+            );
+        }
+        println!(
+            "{} passed, {} failed",
+            self.told.len() - self.failed.len(),
+            self.failed.len()
+        );
+    }
+}
+
+fn shorten(reason: &str) -> String {
+    reason.chars().take(REASON).collect()
+}
+
+/// Adds a line to the list of stories that are to be mended.
+fn note_flaky(name: &str, reason: &str) {
+    let time = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default()
+        .as_secs();
+    let line = json!({"time": time, "story": name, "reason": shorten(reason)});
+    let path = binaries::target().join("flaky.json");
+    let file = std::fs::File::options()
+        .create(true)
+        .append(true)
+        .open(path);
+    if let Err(error) = file.and_then(|mut file| writeln!(file, "{line}")) {
+        eprintln!("target/flaky.json: {error}");
+    }
+}

@@ -1,0 +1,93 @@
+//! Directories that belong to a run: each names the process that made it, so that a later run can remove what a killed one has left, and
+//! leaves alone what belongs to a run that is still at work.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::{leftovers, procfs};
+
+/// The file in each directory that names its owner: a process id and when that process started.
+const OWNER: &str = "owner";
+/// How long killed processes may take to be gone.
+const END: Duration = Duration::from_secs(60);
+
+/// Notes that a directory belongs to this process.
+///
+/// # Errors
+/// When the note cannot be written.
+pub fn claim(directory: &Path) -> std::io::Result<()> {
+    let own = std::process::id();
+    let text = format!("{own} {}", start_time(own as i32).unwrap_or_default());
+    fs::write(directory.join(OWNER), text)
+}
+
+/// Finds the directories in `parent` with names that begin with `prefix` whose owner is gone.
+pub fn find_abandoned(parent: &Path, prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
+    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
+    let is_abandoned = |directory: &PathBuf| {
+        let owner = fs::read_to_string(directory.join(OWNER)).ok();
+        owner.is_some_and(|owner| !is_alive(&owner))
+    };
+    named
+        .map(|entry| entry.path())
+        .filter(is_abandoned)
+        .collect()
+}
+
+/// Ends the processes that an abandoned directory is used by, and removes their cgroups, their mounts here, and the directory.
+///
+/// # Errors
+/// Names the first thing that could not be removed.
+pub fn remove_abandoned(directory: &Path) -> anyhow::Result<()> {
+    // In a servant's mount namespace nothing of the directory needs to be seen: its processes are known by their parents.
+    let pids = procfs::with_descendants(&leftovers::processes_of(directory));
+    let mut cgroups: Vec<PathBuf> = pids
+        .iter()
+        .flat_map(|pid| procfs::cgroups(*pid))
+        .filter(|path| {
+            path.parent()
+                .is_some_and(|parent| parent.ends_with("cloudroid"))
+        })
+        .collect();
+    cgroups.sort();
+    cgroups.dedup();
+    for pid in &pids {
+        let _ = kill(Pid::from_raw(*pid), Signal::SIGKILL);
+    }
+    let begun = Instant::now();
+    while let Some(pid) = pids.iter().find(|pid| procfs::is_running(**pid)) {
+        ensure!(begun.elapsed() < END, "process {pid} does not end");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    for cgroup in &cgroups {
+        // A process that has just ended is charged there for a moment longer.
+        while fs::remove_dir(cgroup)
+            .is_err_and(|error| error.kind() == std::io::ErrorKind::ResourceBusy)
+        {
+            ensure!(begun.elapsed() < END, "{} stays busy", cgroup.display());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+    leftovers::unmount_below(directory);
+    fs::remove_dir_all(directory).with_context(|| directory.display().to_string())
+}
+
+/// Tells if the process that wrote this note is still there.
+fn is_alive(owner: &str) -> bool {
+    let (pid, start) = owner.split_once(' ').unwrap_or((owner, ""));
+    pid.parse()
+        .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == start))
+}
+
+/// When a process started, in ticks since the machine did: process ids are used again (proc(5), field 22 of `stat`).
+fn start_time(pid: i32) -> Option<String> {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    let rest = stat.rsplit_once(") ")?.1;
+    rest.split(' ').nth(19).map(str::to_owned)
+}
