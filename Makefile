@@ -25,6 +25,10 @@ export CLOUDROID_WEB_MODULES := $(WEB_TEST)/node_modules
 AUDIT := $(CACHE)/audit-$(shell sha256sum scripts/audit.txt | cut -c1-12)
 PREFIX ?= /usr/local
 
+.PHONY: check
+check: ## after each change, within minutes: tests and stories of the crates that changed; DRY=1 only says which, BASE=commit since when
+	@DEV="$(DEV)" SEED="$(SEED)" BASE="$(BASE)" DRY="$(DRY)" scripts/check
+
 .PHONY: help
 help: ## what can be asked for
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -99,6 +103,10 @@ define beside
 	@strip --strip-debug -o "$(CARGO_TARGET_DIR)/$(1)/stubs/x86_64/cloudroid-stub" "$(CARGO_TARGET_DIR)/$(1)/cloudroid-stub"
 endef
 
+.PHONY: beside-dev
+beside-dev:
+	$(call beside,debug)
+
 .PHONY: build-dev
 build-dev: init web
 	@cargo build $(DEV) --all-targets
@@ -148,11 +156,17 @@ audit: ## look for known vulnerabilities of dependencies; ADVISORIES=DIR names a
 SEED ?= 1
 
 .PHONY: unit
-unit: build-dev ## the crates' own tests; SEED=n for other random cases than the usual
+ifneq ($(ONLY),)
+unit:
+	@DEV="$(DEV)" SEED="$(SEED)" scripts/check unit $(ONLY)
+else
+unit: build-dev ## the crates' own tests; ONLY="ros link" those of some, SEED=n for other random cases than the usual
 	@echo "== unit tests"
 	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --all-targets
 	@echo "== the codec without video"
 	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties -- a_build_without_video
+
+endif
 
 # The stories are a test target of Cargo's that says so and ends where it is run with all others.
 TELL := CLOUDROID_STORIES=1 cargo test $(DEV) --test stories --

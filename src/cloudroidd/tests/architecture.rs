@@ -1,7 +1,11 @@
-//! The table in ARCHITECTURE.md says which crate uses which. It is compared with the manifests.
+//! What is written down of the repository is compared with the repository: in ARCHITECTURE.md which crate uses which, in
+//! docs/security.md which stories security rests on, in tests/subjects.rs which crates stories are about.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+
+#[path = "../../../tests/subjects.rs"]
+mod subjects;
 
 /// The repository.
 fn root() -> PathBuf {
@@ -147,4 +151,49 @@ fn the_stories_that_security_rests_on_exist() {
         counted += 1;
     }
     assert_eq!(counted, 5, "{counts}");
+}
+
+#[test]
+fn every_module_of_stories_and_every_crate_has_a_subject() {
+    let directory = root().join("tests/stories");
+    let files = std::fs::read_dir(directory).expect("it is there");
+    let modules: BTreeSet<String> = files
+        .map(|entry| entry.expect("a file").path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))
+        .map(|path| path.file_stem().expect("a name").display().to_string())
+        .collect();
+    let told: Vec<&str> = subjects::SUBJECTS.iter().map(|row| row.0).collect();
+    assert!(
+        told.is_sorted_by(|one, other| one < other),
+        "rows stand in the order of their names, each once: {told:?}"
+    );
+    for module in &modules {
+        assert!(
+            told.contains(&module.as_str()),
+            "tests/subjects.rs has no row for the stories of {module}: name the crates that they are about"
+        );
+    }
+    let members = members();
+    let mut named = BTreeSet::new();
+    for (module, crates) in subjects::SUBJECTS {
+        assert!(
+            modules.contains(*module),
+            "tests/subjects.rs has a row for {module}, and there is no tests/stories/{module}.rs"
+        );
+        assert!(!crates.is_empty(), "the row of {module} names no crate");
+        for name in *crates {
+            assert!(
+                members.values().any(|member| member == name),
+                "the row of {module} names {name}, which is no crate of the workspace"
+            );
+            named.insert(*name);
+        }
+    }
+    for (directory, name) in &members {
+        let ships = directory.starts_with("src/") || directory == "rootfs_builder";
+        assert!(
+            !ships || named.contains(name.as_str()),
+            "no row of tests/subjects.rs names {name}: no story would be told for a change in it"
+        );
+    }
 }
