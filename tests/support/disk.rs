@@ -56,7 +56,7 @@ pub fn mount_on(place: &Path, parent: &Path) -> anyhow::Result<()> {
     ];
     run(Command::new("mke2fs").args(["-t", "ext4"]).args(format))?.succeeded()?;
     // What is on it outlives no power cut, so nothing waits for the disk below.
-    let options = "loop,noatime,nobarrier,data=writeback,discard";
+    let options = "loop,noatime,nobarrier,data=writeback";
     run(Command::new("mount").args(["-t", "ext4", "-o", options, path, path_str(place)]))?
         .succeeded()?;
     let _ = std::fs::remove_dir(place.join("lost+found"));
