@@ -8,7 +8,7 @@ use support::acme::Directory;
 use support::daemon::Daemon;
 use support::deployer::{Outcome, run};
 use support::machine::free_port;
-use support::patience::{patience, scaled_seconds};
+use support::patience::{patience, scale_seconds};
 use support::world::world;
 use support::{Verdict, until};
 
@@ -80,7 +80,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     )?;
     drop(lost);
     // One that does, where it is told to look. The account with the one before is no account with this one.
-    let brief = directory.opens(elsewhere, scaled_seconds(9))?;
+    let brief = directory.opens(elsewhere, scale_seconds(9))?;
     let first = awaits_event(&daemon, "certificate-shown", &[NAME])?;
     let answer = curl(&daemon, &brief.root())?.succeeded()?;
     ensure!(answer.stdout.contains("200"), "{}", answer.said());

@@ -12,7 +12,7 @@ use ros::bus::{Bus, BusError, RosVersion, ServiceHandler, ServiceType};
 use ros::schema::Registry;
 use support::Verdict;
 use support::cutter::Cutter;
-use support::patience::{self, Deadline, patience, scaled_seconds};
+use support::patience::{self, Deadline, patience, scale_seconds};
 use support::ros_system::Node;
 use support::site::{Running, Site};
 use support::twins::{self, Twin, answer_of, trigger};
@@ -59,7 +59,7 @@ impl Secret {
         let mut now = self.calls.subscribe();
         let called = site.runtime.block_on(async {
             let called = now.wait_for(|now| *now >= calls);
-            patience::within(called).await.is_ok()
+            patience::wait_for(called).await.is_ok()
         });
         ensure!(called, "{calls} calls should have come");
         Ok(())
@@ -160,7 +160,7 @@ fn fails_at_last(
     words: &str,
     may: &[&str],
 ) -> anyhow::Result<()> {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         if let Err(error) = ask() {
             let text = format!("{error:#}");
@@ -178,7 +178,7 @@ fn succeeds_at_last(
     ask: impl Fn() -> anyhow::Result<String>,
     may: &[&str],
 ) -> anyhow::Result<String> {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         match ask() {
             Ok(words) => return Ok(words),
@@ -224,7 +224,7 @@ fn is_sought(site: &Site, app: &Arc<dyn Bus>, service: &str, stub: &Running) -> 
 
 /// The command line of a caller of ROS 2 that waits for an answer as long as takes so many seconds where nothing else runs.
 fn with_patience(mut argv: Vec<String>, seconds: u64) -> Vec<String> {
-    let seconds = scaled_seconds(seconds);
+    let seconds = scale_seconds(seconds);
     argv.extend(["-p".to_owned(), format!("patience:={seconds}.0")]);
     argv
 }
@@ -476,7 +476,7 @@ pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link(ros: RosVersio
     // With the daemon the link is gone for good, and the node is told so; its next call is answered.
     let time = match ros {
         RosVersion::One => patience(),
-        RosVersion::Two => patience::scaled(MEANWHILE),
+        RosVersion::Two => patience::scale(MEANWHILE),
     };
     let asked = begins_within(&site, &app, ask, time);
     secret.is_called(&site, calls + 2)?;

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
 use support::deployer::path_str;
-use support::patience::scaled_seconds;
+use support::patience::scale_seconds;
 use support::robot::Robot;
 use support::world::{HERALD, world};
 
@@ -76,7 +76,7 @@ fn a_recording_is_read_and_replayed(daemon: &Daemon, servant: &str, robot: &mut 
     let of = ["/name", "/square", "/greeting"];
     let mut typed = vec!["--format", "json", "record", servant, "-o", path_str(&file)];
     typed.extend(of.iter().flat_map(|topic| ["--topic", topic]));
-    let duration = format!("{}s", scaled_seconds(3));
+    let duration = format!("{}s", scale_seconds(3));
     typed.extend(["--duration", &*duration]);
     let mut summary = Value::Null;
     while_it_cries(robot, || {

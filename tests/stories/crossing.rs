@@ -12,7 +12,7 @@ use ros::schema::{MessageType, Registry};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::layout::Layout;
-use support::patience::{Deadline, within};
+use support::patience::{Deadline, wait_for};
 use support::ros_system::Node;
 use support::site::{Running, Site, text_of};
 use support::twins::triggered;
@@ -256,7 +256,7 @@ pub fn listens(
     let mut subscription = site.hears(app, topic)?;
     let connected = site.runtime.block_on(async {
         let connected = subscription.matched.wait_for(|now| now.connected() > 0);
-        within(connected).await.is_ok()
+        wait_for(connected).await.is_ok()
     });
     ensure!(connected, "nobody publishes {topic}");
     Ok(subscription)
@@ -325,7 +325,7 @@ pub fn simulated_time_is_the_robot_s(ros: RosVersion) -> Verdict {
     let mut seen = site.hears(&app, "/crossing/seen")?;
     // The clock stands until the next tick, so it is asked for, not waited for.
     let told = || Ok(triggered(&site, &app, "/crossing/now")?.1);
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         let now = with_log(told(), &stub)?;
         if now == simulated.to_string() {
@@ -536,7 +536,7 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             };
             last.len() == SETTLED && last.iter().all(|(up, down)| is(*up) && is(*down))
         };
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         let mut number = 0;
         while number < TRIED || !settled(&carried) {
             deadline

@@ -10,7 +10,7 @@ use ros::bus::{BusError, Graph, RosVersion, WireFormat};
 use support::Verdict;
 use support::cutter::Cutter;
 use support::daemon::Daemon;
-use support::patience::{Deadline, patience, scaled, within};
+use support::patience::{Deadline, patience, scale, wait_for};
 use support::site::{Site, string_of, text_of};
 use support::twins::{Twin, sum, sum_of};
 use support::world::world;
@@ -140,7 +140,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                 while !over() {
                     count += 1;
                     names.publish(string_of(WireFormat::of(ros), &count.to_string()));
-                    let greeting = within(greetings.messages.recv()).await;
+                    let greeting = wait_for(greetings.messages.recv()).await;
                     let greeting = greeting
                         .ok()
                         .flatten()
@@ -166,7 +166,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                         fence.get_or_insert(number);
                         app.call("/add_two", sum(ros, number), patience()).await?;
                     }
-                    let pause = scaled(PAUSE);
+                    let pause = scale(PAUSE);
                     while let Ok(Some(told)) =
                         tokio::time::timeout(pause, sums.messages.recv()).await
                     {
@@ -182,7 +182,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                 }
             };
             let all = async { tokio::try_join!(calls, greet, hear) };
-            let deadline = Deadline::of_many(u32::try_from(cuts / 60 + 1).unwrap_or(1));
+            let deadline = Deadline::begin_many(u32::try_from(cuts / 60 + 1).unwrap_or(1));
             let ((), greeted, executed) = deadline.limit(all).await.with_context(|| {
                 let cuts = cutter.cuts();
                 format!("after {cuts} cuts {done:?} callers are done, {answered:?} answers")

@@ -109,7 +109,7 @@ impl Scene {
     /// Shows pictures that nobody answers in time until the local original is started, for so many times. Two suffice, unless one is answered all the same: by
     /// a local original that has not ended yet.
     fn asks_until_started(&mut self, times: usize) -> Verdict {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         self.asks();
         let mut next = Instant::now();
         while self.count("the local original is started") < times {
@@ -134,7 +134,7 @@ impl Scene {
     /// Shows pictures, not too many at once, until the local original has been stopped as often as it was started: pictures that gave way to newer ones while the
     /// network was slow are late one by one, and may start it once more.
     fn asks_until_stopped(&mut self) -> Verdict {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         let starts = |scene: &Self| scene.count("the local original is started");
         while self.count("the local original is stopped") < starts(self) {
             deadline.check(|| format!("it should be stopped:\n{}", self.stub.said()))?;
@@ -156,7 +156,7 @@ impl Scene {
 
     /// Shows pictures, one after the other is answered, until the stub has said this so many times.
     fn asks_until(&mut self, words: &str, times: usize) -> Verdict {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         while self.count(words) < times {
             deadline.check(|| format!("it should say {words:?}:\n{}", self.stub.said()))?;
             let number = self.asks();
@@ -196,7 +196,7 @@ impl Scene {
 
     /// Waits until the robot's diagnostics say this.
     fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Verdict {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         loop {
             let message = self.site.next(diagnostics)?;
             let said = String::from_utf8_lossy(&message.bytes);
@@ -495,7 +495,7 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
     let less = ["set", id, "--cpus", "0.05"];
     scene.daemon.deployer().types(&less)?.succeeded()?;
     // Each takes it half a tenth of a second of a whole core.
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     while !scene.explained()?["causes"]
         .to_string()
         .contains("held back by its CPU limit")

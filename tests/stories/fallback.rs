@@ -196,7 +196,7 @@ fn says(stub: &Running, words: &str, times: usize) -> Verdict {
 
 /// Waits until a topic's message has these words.
 fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Verdict {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         let message = site.next(subscription)?;
         let said = String::from_utf8_lossy(&message.bytes).into_owned();
@@ -313,7 +313,7 @@ pub fn a_promise_holds_without_a_server_too_until_it_comes(ros: RosVersion) -> V
     way.cut(false);
     says(&stub, "linked to", 1)?;
     // What nobody could answer in time has made it doubt the cloud: it is asked until it is trusted.
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     while !stub.said().contains("the local original is stopped") {
         robot.is_found((1, 1), &stub)?;
         deadline.check(|| stub.said())?;

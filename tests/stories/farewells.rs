@@ -46,7 +46,7 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
     };
     let mut stub = begins("frozen")?;
     kill(pid, Signal::SIGSTOP)?;
-    let deadline = Deadline::of(LAUNCH);
+    let deadline = Deadline::begin_for(LAUNCH);
     stub.signal(Signal::SIGTERM)?;
     let ended = stub.ends();
     let is_late = deadline.is_over();
@@ -58,7 +58,7 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
     })?;
     let mut stub = begins("killed")?;
     daemon.is_killed()?;
-    let deadline = Deadline::of(LAUNCH);
+    let deadline = Deadline::begin_for(LAUNCH);
     stub.signal(Signal::SIGTERM)?;
     stub.ends()?;
     let is_late = deadline.is_over();

@@ -255,7 +255,7 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
     let told = told.with_context(|| stub.said())?;
     ensure!(!stub.said().contains("is stopped"), "{}", stub.said());
     cable.restore()?;
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     let mut asked = 0;
     while !stub.said().contains("the local original is stopped") {
         deadline.check(|| stub.said())?;

@@ -5,7 +5,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::json;
 use support::Verdict;
-use support::patience::scaled_seconds;
+use support::patience::scale_seconds;
 use support::world::world;
 
 pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
@@ -24,7 +24,7 @@ pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
             .ok_or_else(|| status.to_string()))
     })?;
     // Twice as long it hangs: before it is stopped it is not to be taken for that.
-    let rrt = scaled_seconds(1);
+    let rrt = scale_seconds(1);
     let mut robot = daemon.robot(&format!("adder_py?robot=one&rrt={rrt}s"))?;
     let sum = json!({"a": 1, "b": 1});
     robot.calls("/add_two", sum.clone())?;

@@ -429,7 +429,7 @@ impl Counting {
 
     /// The topics of the first line that is so.
     fn tells(&self, is: impl Fn(&[Value]) -> bool) -> anyhow::Result<Vec<Value>> {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         let mut last = String::new();
         loop {
             let line = patience::receive(&self.lines);

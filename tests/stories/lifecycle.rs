@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::deployer::path_str;
-use support::patience::{patience, within};
+use support::patience::{patience, wait_for};
 use support::robot::Robot;
 use support::site::{Running, Site, string_of};
 use support::world::world;
@@ -216,7 +216,7 @@ impl Guarded {
                 ensure!(node.state().await? == *from);
                 node.change(*transition, patience()).await?;
                 for (from, to) in [(*from, *by), (*by, *to)] {
-                    let told = within(changes.next()).await;
+                    let told = wait_for(changes.next()).await;
                     let told = told.context("its state's change should be told")?;
                     ensure!(told == Some(StateChange { from, to }), "{told:?}");
                 }

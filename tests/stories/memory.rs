@@ -7,7 +7,7 @@ use anyhow::{Context, bail, ensure};
 use serde_json::json;
 use support::Verdict;
 use support::daemon::Daemon;
-use support::patience::{Patient, scaled_seconds};
+use support::patience::{Patient, scale_seconds};
 use support::robot::Robot;
 use support::world::world;
 use tokio_tungstenite::tungstenite::Message;
@@ -38,7 +38,7 @@ fn begins_a_trial(daemon: &Daemon) -> anyhow::Result<Patient<UnixStream>> {
 
 pub fn what_is_begun_and_never_ended_costs_its_owner() -> Verdict {
     // All have to have begun before the first is late.
-    let late = scaled_seconds(8);
+    let late = scale_seconds(8);
     let daemon = world()
         .own("memory")
         .config(&format!(

@@ -10,7 +10,7 @@ use serde_json::json;
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::machine::Machine;
-use support::patience::tell;
+use support::patience::tell_patience;
 use support::world::{ADDER, PEOPLE, TELLER, world};
 use support::{Verdict, binaries};
 
@@ -27,7 +27,7 @@ impl Adder {
     /// Returns once it has a sum.
     fn begins(url: &str) -> anyhow::Result<Adder> {
         let mut adds = Command::new(binaries::python());
-        let child = tell(&mut adds)
+        let child = tell_patience(&mut adds)
             .arg(binaries::checkout().join("tests/robots/adds_with_roslibpy.py"))
             .arg(url)
             .stdin(Stdio::piped())
@@ -72,7 +72,7 @@ fn begins_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Res
 fn goes(daemon: &Daemon, url: &str, step: &str, token: &str) -> Command {
     let checkout = binaries::checkout();
     let mut node = Command::new("node");
-    tell(&mut node)
+    tell_patience(&mut node)
         .arg(checkout.join("tests/web/page.cjs"))
         .args([step, url])
         .arg(checkout.join("target/web"))

@@ -10,7 +10,7 @@ use anyhow::{Context, ensure};
 use support::daemon::{Daemon, Setup};
 use support::deployer::{Outcome, path_str, run};
 use support::machine::Machine;
-use support::patience::{patience, scaled_seconds};
+use support::patience::{patience, scale_seconds};
 use support::site::{Running, Site};
 use support::world::{ADDER, TELLER, world};
 use support::{Verdict, binaries, until};
@@ -328,7 +328,7 @@ for thread in threads:
 "#;
 
 pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict {
-    let good_for = format!("robot_certificates = \"{}s\"\n", scaled_seconds(6));
+    let good_for = format!("robot_certificates = \"{}s\"\n", scale_seconds(6));
     let daemon = secure("renewing", &good_for).start()?;
     let deployer = daemon.deployer();
     deployer

@@ -8,7 +8,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{Bus, ServiceHandler, ServiceType, reaches};
 use support::Verdict;
-use support::patience::{Deadline, scaled};
+use support::patience::{Deadline, scale};
 use support::site::Site;
 use support::world::world;
 
@@ -100,10 +100,10 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
         transforms.publish(transform.clone());
         scans.publish(scan.clone());
     };
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     let there = || {
         let connected = reaches(goals.matched(), 1);
-        let moment = scaled(Duration::from_millis(200));
+        let moment = scale(Duration::from_millis(200));
         let wait = async { tokio::time::timeout(moment, connected).await };
         site.runtime.block_on(wait).is_ok()
     };

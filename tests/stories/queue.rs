@@ -7,7 +7,7 @@ use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
-use support::patience::{connect, scaled_seconds};
+use support::patience::{connect, scale_seconds};
 use support::world::{GREETER, world};
 
 /// Between looks at what a push has come to.
@@ -50,7 +50,7 @@ fn stub_is_answered(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
 
 pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdict {
     // While the second waits, the third has to come.
-    let waits = scaled_seconds(5);
+    let waits = scale_seconds(5);
     let daemon = full("queue", &format!("queue = 1\ndeadline = \"{waits}s\""))?;
     let mut first = daemon.robot("greeter_cpp?robot=first")?;
     first.calls("/rosapi/get_time", json!({}))?;

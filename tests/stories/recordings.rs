@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::binaries;
 use support::deployer::{path_str, run};
-use support::patience::{scaled_seconds, tell};
+use support::patience::{scale_seconds, tell_patience};
 use support::world::world;
 
 use crate::access::token;
@@ -43,7 +43,7 @@ impl Talker {
         talks
             .arg(binaries::checkout().join("tests/robots/talks_with_roslibpy.py"))
             .arg(url);
-        let mut child = tell(&mut talks)
+        let mut child = tell_patience(&mut talks)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()?;
@@ -83,7 +83,7 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     let file = place.path().join("said.mcap");
     let talker = Talker::begins(&scene)?;
     // Long enough for all topics to be connected, and for some words.
-    let duration = format!("{}s", scaled_seconds(3));
+    let duration = format!("{}s", scale_seconds(3));
     let typed = [
         "--format",
         "json",

@@ -20,7 +20,7 @@ use serde_json::{Value, json};
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
 use support::layout::Layout;
-use support::patience::{Deadline, scaled, tell, within};
+use support::patience::{Deadline, scale, tell_patience, wait_for};
 use support::people::{self, Camera};
 use support::site::{Running, Site, string_of};
 use support::world::{ADDER, HERALD, SEER, world};
@@ -271,7 +271,7 @@ fn counts(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
     let goal = Layout::of(RosVersion::Two).u32(to).finish();
     client.send("goal", goal, events);
     site.runtime.block_on(async {
-        let ended = within(heard.ended.notified());
+        let ended = wait_for(heard.ended.notified());
         ended.await.context("a result should come")
     })?;
     let end = heard.end.lock().take().context("an end")?;
@@ -423,7 +423,7 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     let mut command = Command::new(binaries::ros2().join("bin/python"));
     command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
     site.system.is_of(&mut command);
-    tell(&mut command)
+    tell_patience(&mut command)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped());
     let mut application = command.spawn()?;
@@ -503,7 +503,7 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
     daemon.is_killed()?;
     let daemon = setup.listen(&address).start()?;
     // A call made meanwhile is answered, or forgotten, of which DDS has no way to tell its caller; the next one is answered.
-    let meanwhile = app.call("/greet", request.clone(), scaled(MEANWHILE));
+    let meanwhile = app.call("/greet", request.clone(), scale(MEANWHILE));
     match site.runtime.block_on(meanwhile) {
         Ok(_) | Err(BusError::Timeout { .. }) => {}
         Err(other) => return Err(other.into()),
@@ -572,7 +572,7 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             };
             last.len() == SETTLED && last.iter().all(is)
         };
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         let mut number = 0;
         while number < TRIED || !settled(&carried) {
             deadline

@@ -222,7 +222,7 @@ pub fn a_shared_service_grows_under_load_and_shrinks_after_it() -> Verdict {
     let mut busy = (0..6)
         .map(|number| sharer.robot(&daemon, &format!("r{number}")))
         .collect::<anyhow::Result<Vec<_>>>()?;
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         for robot in &mut busy {
             robot.says(

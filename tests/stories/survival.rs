@@ -302,7 +302,7 @@ fn respawns(daemon: &Daemon) -> anyhow::Result<Vec<Value>> {
 /// Ends phoenix again when it is back, which it is not before its delay is over.
 fn end_again_once_it_is_back(daemon: &Daemon, node: &str, how: &str) -> Verdict {
     let ended = respawns(daemon)?.last().context("its end")?["time"].clone();
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
     loop {
         let answer = robot.calls(

@@ -33,7 +33,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
         dribbler.set_nonblocking(true)?;
         let begun = index % 2 == 0;
         let mut heard = Vec::new();
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         loop {
             deadline.check(|| format!("connection {index} is still open"))?;
             // One byte more keeps nobody in: the time is for the whole header.

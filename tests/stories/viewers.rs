@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::binaries;
 use support::deployer::run;
-use support::patience::tell;
+use support::patience::tell_patience;
 use support::robot::{Refusal, Robot};
 use tokio_tungstenite::tungstenite::{Bytes, Message};
 
@@ -36,7 +36,7 @@ pub fn foxglove(program: &str, url: &str, part: &str) -> Verdict {
         .arg(binaries::checkout().join("tests/robots").join(program))
         .args([url, part])
         .env("NODE_PATH", binaries::node_modules());
-    let said = run(tell(&mut client))?.succeeded()?.stdout;
+    let said = run(tell_patience(&mut client))?.succeeded()?.stdout;
     ensure!(said.ends_with("done\n"), "{said}");
     Ok(())
 }
@@ -175,7 +175,7 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
     let mut slow = Robot::on_a_short_line(&address(&scene, &eve), &[PROTOCOL])?;
     asks_for_pictures(&mut slow)?;
     support::until("a picture that it does not take", || {
-        let bytes = slow.waiting()?;
+        let bytes = slow.counts_waiting()?;
         Ok((bytes >= SOME)
             .then_some(())
             .ok_or(format!("{bytes} bytes")))

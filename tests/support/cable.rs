@@ -19,7 +19,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use nix::sched::CloneFlags;
 
-use crate::patience::scaled;
+use crate::patience::scale;
 use crate::shaper::Shaper;
 
 /// Names and addresses of this process's cables.
@@ -238,7 +238,7 @@ impl Drop for Cable {
         self.over.store(true, Ordering::Relaxed);
         // Wakes whoever accepts.
         let _ = self.restore();
-        let _ = TcpStream::connect_timeout(&self.server, scaled(Duration::from_secs(5)));
+        let _ = TcpStream::connect_timeout(&self.server, scale(Duration::from_secs(5)));
         let _ = ip(&["link", "del", &self.ends[0]]);
         let _ = ip(&["netns", "del", &self.name]);
     }

@@ -32,7 +32,7 @@ use std::time::Duration;
 
 use anyhow::bail;
 
-use crate::patience::{Deadline, waited};
+use crate::patience::{Deadline, describe_slowness};
 
 /// Between two looks at what no event tells of.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -49,14 +49,14 @@ pub fn until<T>(
     what: &str,
     mut look: impl FnMut() -> anyhow::Result<Result<T, String>>,
 ) -> anyhow::Result<T> {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         match look()? {
             Ok(found) => return Ok(found),
             Err(instead) if deadline.is_over() => {
                 bail!(
                     "{what} did not come about; instead: {instead}\n{}",
-                    waited()
+                    describe_slowness()
                 )
             }
             Err(_) => std::thread::sleep(LOOK_EVERY),

@@ -64,17 +64,21 @@ impl Meter {
 
     fn look_for_ever(&self) {
         let cores = thread::available_parallelism().map_or(1, NonZero::get) as f64;
-        let mut stalled = stalls();
+        let mut stalled = sum_stalls();
         let mut looked = Instant::now();
-        // What is running when the first story begins is known before it waits for anything.
-        let mut busy = runnable().map_or(1.0, |threads| (threads / cores).clamp(1.0, BUSIEST));
+        // What runs when the first story begins is known before that waits for anything.
+        let mut busy =
+            count_runnable().map_or(1.0, |threads| (threads / cores).clamp(1.0, BUSIEST));
         loop {
+            self.busy.store(busy.to_bits(), Ordering::Relaxed);
+            // Numbers that are not negative are ordered as their bits are.
+            self.busiest.fetch_max(busy.to_bits(), Ordering::Relaxed);
             thread::sleep(LOOK_EVERY);
             let passed = looked.elapsed();
             looked += passed;
             let late = passed.as_secs_f64() / LOOK_EVERY.as_secs_f64();
-            let wanted = runnable().map_or(1.0, |threads| threads / cores);
-            let stalls = stalls();
+            let wanted = count_runnable().map_or(1.0, |threads| threads / cores);
+            let stalls = sum_stalls();
             let stood = stalls.saturating_sub(std::mem::replace(&mut stalled, stalls));
             let moved = 1.0 - (stood.as_secs_f64() / passed.as_secs_f64()).min(1.0);
             let now = (wanted.max(late).max(1.0) / moved.max(1.0 / BUSIEST)).min(BUSIEST);
@@ -84,9 +88,6 @@ impl Meter {
             let worked = passed.as_secs_f64() / slowly;
             self.worked
                 .fetch_add((worked * 1e9) as u64, Ordering::Relaxed);
-            self.busy.store(busy.to_bits(), Ordering::Relaxed);
-            // Numbers that are not negative are ordered as their bits are.
-            self.busiest.fetch_max(busy.to_bits(), Ordering::Relaxed);
         }
     }
 
@@ -96,7 +97,7 @@ impl Meter {
 }
 
 /// Returns how many threads of this machine run or want to, but for the one that asks (proc_loadavg(5)).
-fn runnable() -> Option<f64> {
+fn count_runnable() -> Option<f64> {
     let text = fs::read_to_string("/proc/loadavg").ok()?;
     let (running, _) = text.split_whitespace().nth(3)?.split_once('/')?;
     Some((running.parse::<f64>().ok()? - 1.0).max(0.0))
@@ -104,7 +105,7 @@ fn runnable() -> Option<f64> {
 
 /// Returns for how long since the machine has started somebody waited for the disk, or all for memory
 /// (Documentation/accounting/psi.rst); of a kernel that does not count it, no time.
-fn stalls() -> Duration {
+fn sum_stalls() -> Duration {
     let total = |what: &str, line: &str| -> Option<u64> {
         let text = fs::read_to_string(format!("/proc/pressure/{what}")).ok()?;
         let line = text.lines().find(|said| said.starts_with(line))?;
@@ -125,23 +126,23 @@ pub fn busiest() -> f64 {
 }
 
 /// Returns what takes `time` where nothing else runs, as long as it takes now.
-pub fn scaled(time: Duration) -> Duration {
+pub fn scale(time: Duration) -> Duration {
     time.mul_f64(busyness())
 }
 
 /// Returns whole seconds as they are now, for settings of programs whose own times a busy machine would not keep.
-pub fn scaled_seconds(seconds: u64) -> u64 {
-    scaled(Duration::from_secs(seconds)).as_secs_f64().ceil() as u64
+pub fn scale_seconds(seconds: u64) -> u64 {
+    scale(Duration::from_secs(seconds)).as_secs_f64().ceil() as u64
 }
 
 /// Returns how long a story waits, for calls that take one limit. Where there is a loop, a [`Deadline`] is better: it
 /// follows the machine while it waits.
 pub fn patience() -> Duration {
-    scaled(LONG)
+    scale(LONG)
 }
 
 /// Tells a program of the stories how long it is to wait.
-pub fn tell(command: &mut Command) -> &mut Command {
+pub fn tell_patience(command: &mut Command) -> &mut Command {
     command.env(VARIABLE, patience().as_secs().to_string())
 }
 
@@ -152,25 +153,19 @@ pub struct Deadline {
     end: Duration,
 }
 
-impl Default for Deadline {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl Deadline {
     /// Returns the one of whatever must come.
-    pub fn new() -> Self {
-        Self::of(LONG)
+    pub fn begin() -> Self {
+        Self::begin_for(LONG)
     }
 
     /// Returns the one of something that takes so many times as long.
-    pub fn of_many(times: u32) -> Self {
-        Self::of(LONG * times)
+    pub fn begin_many(times: u32) -> Self {
+        Self::begin_for(LONG * times)
     }
 
     /// Returns one after so much working time.
-    pub fn of(time: Duration) -> Self {
+    pub fn begin_for(time: Duration) -> Self {
         Self {
             end: METER.worked() + time,
         }
@@ -199,7 +194,7 @@ impl Deadline {
         loop {
             match tokio::time::timeout(SLICE, &mut future).await {
                 Ok(output) => return Ok(output),
-                Err(_) if self.is_over() => bail!("it did not come; {}", waited()),
+                Err(_) if self.is_over() => bail!("it did not come; {}", describe_slowness()),
                 Err(_) => {}
             }
         }
@@ -207,7 +202,7 @@ impl Deadline {
 }
 
 /// Says how busy the machine is, for who reads that something did not come.
-pub fn waited() -> String {
+pub fn describe_slowness() -> String {
     format!(
         "the machine is {:.1} times as slow as it can be",
         busyness()
@@ -218,8 +213,8 @@ pub fn waited() -> String {
 ///
 /// # Errors
 /// When it does not come.
-pub async fn within<F: Future>(future: F) -> anyhow::Result<F::Output> {
-    Deadline::new().limit(future).await
+pub async fn wait_for<F: Future>(future: F) -> anyhow::Result<F::Output> {
+    Deadline::begin().limit(future).await
 }
 
 /// Waits for the next of what another thread says.
@@ -227,13 +222,13 @@ pub async fn within<F: Future>(future: F) -> anyhow::Result<F::Output> {
 /// # Errors
 /// When nothing comes, and when the other thread has ended.
 pub fn receive<T>(said: &Receiver<T>) -> anyhow::Result<T> {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     loop {
         match said.recv_timeout(SLICE) {
             Ok(what) => return Ok(what),
             Err(RecvTimeoutError::Disconnected) => bail!("whoever was to say it has ended"),
             Err(RecvTimeoutError::Timeout) => {
-                deadline.check(|| format!("nothing was said; {}", waited()))?;
+                deadline.check(|| format!("nothing was said; {}", describe_slowness()))?;
             }
         }
     }
@@ -257,9 +252,12 @@ impl Timed for UnixStream {
     }
 }
 
-/// A connection each read of which waits as long as a story does.
+/// A connection each read of which waits as long as a story does, unless it is told another time.
 #[derive(Debug)]
-pub struct Patient<S>(S);
+pub struct Patient<S> {
+    stream: S,
+    is_limited: bool,
+}
 
 impl<S: Timed> Patient<S> {
     /// Wraps one.
@@ -268,21 +266,35 @@ impl<S: Timed> Patient<S> {
     /// Where the kernel sets no time.
     pub fn new(stream: S) -> io::Result<Self> {
         stream.set_patience(Some(SLICE))?;
-        Ok(Self(stream))
+        Ok(Self {
+            stream,
+            is_limited: false,
+        })
+    }
+
+    /// Has reads wait no longer than this, or again as long as a story does.
+    ///
+    /// # Errors
+    /// Where the kernel sets no time.
+    pub fn limit(&mut self, time: Option<Duration>) -> io::Result<()> {
+        self.is_limited = time.is_some();
+        // No time at all would be time without an end.
+        let time = time.map_or(SLICE, |time| time.max(Duration::from_millis(1)));
+        self.stream.set_patience(Some(time))
     }
 
     /// Returns the connection.
     pub fn get(&self) -> &S {
-        &self.0
+        &self.stream
     }
 }
 
 impl<S: Read> Read for Patient<S> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         loop {
-            match self.0.read(buffer) {
-                Err(error) if is_slow(&error) && !deadline.is_over() => {}
+            match self.stream.read(buffer) {
+                Err(error) if is_slow(&error) && !self.is_limited && !deadline.is_over() => {}
                 read => return read,
             }
         }
@@ -291,11 +303,11 @@ impl<S: Read> Read for Patient<S> {
 
 impl<S: Write> Write for Patient<S> {
     fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
-        self.0.write(buffer)
+        self.stream.write(buffer)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.0.flush()
+        self.stream.flush()
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::net::TcpStream;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
@@ -9,7 +10,7 @@ use tokio_tungstenite::tungstenite::http::Uri;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::{self, ClientRequestBuilder, Message, WebSocket};
 
-use crate::patience::{Deadline, Patient, is_slow, waited};
+use crate::patience::{Deadline, Patient, describe_slowness, is_slow};
 
 /// One connection.
 pub struct Robot {
@@ -124,8 +125,16 @@ impl Robot {
         Ok(self.socket.read()?)
     }
 
-    /// How many bytes wait to be read, up to some thousand.
-    pub fn waiting(&self) -> anyhow::Result<usize> {
+    /// The same, if it comes in this time; for measurements.
+    pub fn frame_within(&mut self, time: Duration) -> anyhow::Result<Message> {
+        self.socket.get_mut().limit(Some(time))?;
+        let frame = self.socket.read();
+        self.socket.get_mut().limit(None)?;
+        Ok(frame?)
+    }
+
+    /// Counts bytes that wait to be read, up to some thousand.
+    pub fn counts_waiting(&self) -> anyhow::Result<usize> {
         let mut bytes = vec![0; 64 << 10];
         match self.socket.get_ref().get().peek(&mut bytes) {
             Err(error) if is_slow(&error) => Ok(0),
@@ -138,13 +147,13 @@ impl Robot {
         if let Some(index) = self.backlog.iter().position(&wanted) {
             return Ok(self.backlog.remove(index).expect("just found"));
         }
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         loop {
             deadline.check(|| {
                 let heard = &self.backlog;
                 format!(
                     "{what} did not come; {}; heard instead: {heard:?}",
-                    waited()
+                    describe_slowness()
                 )
             })?;
             let frame = self

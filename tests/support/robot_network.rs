@@ -154,7 +154,7 @@ pub struct Application {
 impl Application {
     /// Starts it; returns when it says that it is ready.
     fn starts(mut command: Command, namespace: &Path) -> anyhow::Result<Self> {
-        patience::tell(&mut command)
+        patience::tell_patience(&mut command)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped());
         let mut child = within(namespace, || command.spawn())?.context("starting a program")?;

@@ -118,7 +118,7 @@ impl Site {
     ) -> anyhow::Result<Graph> {
         let mut graphs = node.bus().graph();
         let found = self.runtime.block_on(async {
-            let found = patience::within(graphs.wait_for(|graph| wanted(graph)));
+            let found = patience::wait_for(graphs.wait_for(|graph| wanted(graph)));
             found
                 .await
                 .map(|found| found.map(|graph| (**graph).clone()))
@@ -166,7 +166,7 @@ impl Site {
     pub fn next(&self, subscription: &mut Subscription) -> anyhow::Result<Message> {
         let next = self
             .runtime
-            .block_on(patience::within(subscription.messages.recv()));
+            .block_on(patience::wait_for(subscription.messages.recv()));
         next.context("a message should come")?
             .context("the topic ended")
     }
@@ -192,10 +192,10 @@ impl Site {
         mut ask: impl FnMut() -> anyhow::Result<()>,
         mut wanted: impl FnMut(&Message) -> anyhow::Result<bool>,
     ) -> anyhow::Result<Message> {
-        let deadline = Deadline::new();
+        let deadline = Deadline::begin();
         loop {
             ask()?;
-            while let Some(message) = self.next_within(subscription, patience::scaled(MOMENT))? {
+            while let Some(message) = self.next_within(subscription, patience::scale(MOMENT))? {
                 if wanted(&message)? {
                     return Ok(message);
                 }
@@ -209,7 +209,7 @@ impl Site {
     pub fn connected(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
         let mut now = publisher.matched();
         let reached = self.runtime.block_on(async {
-            patience::within(now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected() == count))
                 .await
                 .is_ok()
         });
@@ -225,7 +225,7 @@ impl Site {
     pub fn fed(&self, subscription: &Subscription, count: usize) -> anyhow::Result<()> {
         let mut now = subscription.matched.clone();
         let reached = self.runtime.block_on(async {
-            patience::within(now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected() == count))
                 .await
                 .is_ok()
         });

@@ -18,7 +18,7 @@ use ros::schema::{MessageType, Registry};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
-use support::patience::{patience, scaled, tell, within};
+use support::patience::{patience, scale, tell_patience, wait_for};
 use support::site::{Running, Site, registered};
 use support::{Verdict, binaries};
 use tokio::sync::mpsc;
@@ -123,7 +123,7 @@ impl Linked {
         let request = self.request(who, seconds)?;
         let time = match self.sharer.ros {
             RosVersion::One => patience(),
-            RosVersion::Two => scaled(UNANSWERED),
+            RosVersion::Two => scale(UNANSWERED),
         };
         let called = self.app.call(self.work, request, time);
         let answer = match (self.sharer.ros, self.site.runtime.block_on(called)) {
@@ -165,7 +165,7 @@ impl Linked {
 
     /// The end of a goal, and its result.
     fn end(&self, counting: &mut Counting) -> anyhow::Result<(Outcome, Value)> {
-        let ended = within(counting.events.recv());
+        let ended = wait_for(counting.events.recv());
         let ended = self.site.runtime.block_on(ended).context("a result")?;
         let end = ended.context("an end")?.map_err(anyhow::Error::msg)?;
         let of = self.registry.action(self.sharer.count)?;
@@ -365,7 +365,7 @@ fn application(linked: &Linked, daemon: &Daemon, what: &str) -> anyhow::Result<V
     let mut command = Command::new(prefix.join("lib/application/application"));
     command.args(["-c", &text, what]);
     site.system.is_of(&mut command);
-    let told = run(tell(&mut command))?.succeeded();
+    let told = run(tell_patience(&mut command))?.succeeded();
     let told = told.with_context(|| format!("the stub said:\n{}", linked.stub.said()))?;
     serde_json::from_str(&told.stdout).context(told.stdout)
 }

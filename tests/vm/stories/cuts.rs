@@ -62,7 +62,7 @@ fn the_store_verifies() -> Verdict {
 
 /// Waits for what is in the middle.
 fn once(what: &str, there: impl Fn() -> bool) -> Verdict {
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     while !there() {
         deadline.check(|| format!("{what} was not seen"))?;
         std::thread::yield_now();

@@ -220,7 +220,7 @@ pub fn a_fork_bomb_ends_when_its_servant_does() -> Verdict {
     let id = id(&daemon, "small", "bomber")?;
     set(&daemon, &id, &["--pids", "100"])?;
     tries(&mut robot, "bomb", "")?;
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     while control(&id, "pids.current")?.parse::<u64>()? < 95 && !deadline.is_over() {
         std::thread::yield_now();
     }

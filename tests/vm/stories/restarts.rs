@@ -20,7 +20,7 @@ fn count(robot: &mut Robot) -> anyhow::Result<Option<u64>> {
 fn greets(robot: &mut Robot) -> Verdict {
     let before = count(robot)?;
     robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
-    let deadline = Deadline::new();
+    let deadline = Deadline::begin();
     while count(robot)? == before {
         deadline.check(|| "the node hears nothing".to_owned())?;
         robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
