@@ -4,13 +4,15 @@ new one; ends with `done`.
 usage: with_roslibpy.py URL
 """
 
+import os
 import queue
 import sys
 
 import roslibpy
 import roslibpy.ros1.actionlib as actionlib
 
-PATIENCE = 60.0
+# Seconds, longer on a busy machine.
+PATIENCE = float(os.environ.get("STORY_PATIENCE", "60"))
 
 
 def check(what, truth):

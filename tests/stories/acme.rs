@@ -8,6 +8,7 @@ use support::acme::Directory;
 use support::daemon::Daemon;
 use support::deployer::{Outcome, run};
 use support::machine::free_port;
+use support::patience::{patience, scale_seconds};
 use support::world::world;
 use support::{Verdict, until};
 
@@ -24,7 +25,8 @@ fn port(daemon: &Daemon) -> anyhow::Result<u16> {
 fn curl(daemon: &Daemon, authority: &std::path::Path) -> anyhow::Result<Outcome> {
     let port = port(daemon)?;
     run(Command::new("curl")
-        .args(["--silent", "--show-error", "--max-time", "60"])
+        .args(["--silent", "--show-error", "--max-time"])
+        .arg(patience().as_secs().to_string())
         .args(["--write-out", "\n%{http_code}"])
         .args(["--resolve", &format!("{NAME}:{port}:127.0.0.1")])
         .arg("--cacert")
@@ -78,7 +80,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     )?;
     drop(lost);
     // One that does, where it is told to look. The account with the one before is no account with this one.
-    let brief = directory.opens(elsewhere, 9)?;
+    let brief = directory.opens(elsewhere, scale_seconds(9))?;
     let first = awaits_event(&daemon, "certificate-shown", &[NAME])?;
     let answer = curl(&daemon, &brief.root())?.succeeded()?;
     ensure!(answer.stdout.contains("200"), "{}", answer.said());
@@ -134,7 +136,8 @@ pub fn who_comes_for_something_else_is_answered_no_challenge() -> Verdict {
     }
     // Where challenges alone are answered, nothing is.
     let said = run(Command::new("curl")
-        .args(["--silent", "--show-error", "--insecure", "--max-time", "60"])
+        .args(["--silent", "--show-error", "--insecure", "--max-time"])
+        .arg(patience().as_secs().to_string())
         .arg(format!("https://127.0.0.1:{elsewhere}/healthz")))?;
     ensure!(said.status != 0, "{}", said.said());
     Ok(())

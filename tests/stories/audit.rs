@@ -8,7 +8,8 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
-use support::robot::{PATIENCE, Robot};
+use support::patience::Patient;
+use support::robot::Robot;
 use support::world::world;
 use support::{Verdict, binaries};
 
@@ -386,8 +387,7 @@ fn asks_as(socket: &Path, uid: u32, groups: &[u32]) -> anyhow::Result<String> {
                 && libc::syscall(libc::SYS_setresuid, uid, uid, uid) == 0
         };
         ensure!(changed, "{}", std::io::Error::last_os_error());
-        let mut stream = UnixStream::connect(socket)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
+        let mut stream = Patient::new(UnixStream::connect(socket)?)?;
         stream.write_all(b"GET /api/v1/tokens HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")?;
         let mut answer = String::new();
         stream.read_to_string(&mut answer)?;

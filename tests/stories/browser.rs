@@ -4,11 +4,10 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, mpsc};
-use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
-use support::robot::PATIENCE;
+use support::patience::{self, Patient};
 use support::world::world;
 use support::{Verdict, binaries};
 
@@ -95,8 +94,7 @@ impl Drop for Browser {
 
 /// What a browser asks a site of a story for: the head of its request, and the body.
 pub fn request(stream: &TcpStream) -> anyhow::Result<(String, Vec<u8>)> {
-    stream.set_read_timeout(Some(PATIENCE))?;
-    let mut reader = BufReader::new(stream.try_clone()?);
+    let mut reader = BufReader::new(Patient::new(stream.try_clone()?)?);
     let (mut head, mut length) = (String::new(), 0);
     while reader.read_line(&mut head)? > 2 {
         let line = head.lines().last().unwrap_or_default().to_lowercase();
@@ -181,7 +179,7 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
     site.serve(listener);
     let profile = world().directory("profile")?;
     let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path(), &[])?;
-    let said = said.recv_timeout(PATIENCE + Duration::from_secs(60));
+    let said = patience::receive(&said);
     drop(browser);
     let said = said.context("the page said nothing")?;
     for way in ["query", "auth", "subprotocol"] {

@@ -1,19 +1,17 @@
 //! A revision is compared with the one that a robot uses, at the robot's own requests, and the robot notices nothing.
 
+use std::cell::RefCell;
 use std::io::{BufRead, BufReader, Lines};
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
+use ros::bus::Message;
 use serde_json::{Value, json};
+use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::{PATIENCE, Robot};
+use support::robot::Robot;
 use support::site::Site;
 use support::world::world;
-use support::{Verdict, until};
-
-/// A message that will come is nearly always there by then.
-const SOON: Duration = Duration::from_millis(200);
 
 /// `cloudroidctl shadow`, while it compares.
 struct Comparing {
@@ -98,16 +96,16 @@ fn pushes(daemon: &Daemon, more: &[&str]) -> Verdict {
 fn listener(daemon: &Daemon, name: &str) -> anyhow::Result<Robot> {
     let mut robot = daemon.robot(&format!("adder_py?robot={name}"))?;
     robot.subscribes("/sums")?;
-    // What is said before the node has connected to it, it does not hear.
+    // What is said before the node has connected to it, it does not hear; what it has heard by then is forgotten.
     support::until("its subscription", || {
         robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
-        Ok(
-            match robot.has_not_heard(|value| value["topic"] == "/sums")? {
-                true => Err("it hears nothing yet".to_owned()),
-                false => Ok(()),
-            },
-        )
+        let hears_nothing = robot.has_not_heard(|value| value["topic"] == "/sums")?;
+        Ok((!hears_nothing)
+            .then_some(())
+            .ok_or_else(|| "it hears nothing yet".to_owned()))
     })?;
+    robot.calls("/add_two", json!({"a": 1, "b": -1}))?;
+    while robot.hears_on("/sums")?["data"] != "0" {}
     Ok(robot)
 }
 
@@ -219,15 +217,9 @@ pub fn what_a_robot_says_is_said_to_a_candidate_too() -> Verdict {
         ensure!(said["data"] == word, "{said}");
         Ok(())
     };
-    // What a node says before its publisher knows of the subscription is lost, as in every ROS.
-    let is_said = |message: &Value| message["topic"] == "/teller/said";
     let before = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "before"}});
-    until("what the node says", || {
-        robot.says(before.clone())?;
-        Ok(match robot.has_not_heard(is_said)? {
-            true => Err("nothing came".to_owned()),
-            false => Ok(()),
-        })
+    robot.says_until(&before, "what the node says", |message| {
+        message["topic"] == "/teller/said"
     })?;
     robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "heard"}}))?;
     while robot.hears_on("/teller/said")?["data"] != "heard" {}
@@ -367,15 +359,14 @@ pub fn a_stubs_node_is_started_in_a_candidate_as_it_is_on_its_robot() -> Verdict
         Ok(sum.to_string())
     };
     // What the node says before all are connected is lost, as in every ROS.
-    let deadline = Instant::now() + PATIENCE;
-    let mut waits = true;
-    while waits {
-        ensure!(Instant::now() < deadline, "no sum came; {}", said());
-        let sum = asks().with_context(said)?;
-        while let Some(said) = site.next_within(&mut sums, SOON)? {
-            waits &= !said.bytes.ends_with(sum.as_bytes());
-        }
-    }
+    let last = RefCell::new(String::new());
+    let ask = || {
+        *last.borrow_mut() = asks()?;
+        Ok(())
+    };
+    let is_last = |said: &Message| Ok(said.bytes.ends_with(last.borrow().as_bytes()));
+    site.asks_until(&mut sums, ask, is_last)
+        .with_context(said)?;
     let mut adds = || -> Verdict {
         let sum = asks()?;
         let said = site.next(&mut sums)?;

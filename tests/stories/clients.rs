@@ -8,6 +8,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, ensure};
 use support::daemon::Daemon;
 use support::deployer::path_str;
+use support::patience::tell_patience;
 use support::world::{FIXTURE, Service, world};
 use support::{Verdict, binaries};
 
@@ -88,7 +89,7 @@ pub fn does_all(
     (service, robot): (Service, &str),
     words: &[String],
 ) -> Verdict {
-    let mut child = command
+    let mut child = tell_patience(&mut command)
         .args(words)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
 use support::deployer::path_str;
+use support::patience::scale_seconds;
 use support::robot::Robot;
 use support::world::{HERALD, world};
 
@@ -22,6 +23,8 @@ fn address(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     Ok(format!("{}?token={secret}", HERALD.name))
 }
 
+/// Between two cries.
+const PAUSE: Duration = Duration::from_millis(50);
 /// The type of what the robot shows.
 const SQUARE: &str = "geometry_msgs/msg/PolygonStamped";
 
@@ -41,7 +44,7 @@ fn while_it_cries(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict 
             while !over.load(Ordering::Relaxed) {
                 robot.says(says("/name", &json!({"data": "rover"})))?;
                 robot.says(says("/square", &square))?;
-                thread::sleep(Duration::from_millis(50));
+                thread::sleep(PAUSE);
             }
             anyhow::Ok(())
         });
@@ -73,7 +76,8 @@ fn a_recording_is_read_and_replayed(daemon: &Daemon, servant: &str, robot: &mut 
     let of = ["/name", "/square", "/greeting"];
     let mut typed = vec!["--format", "json", "record", servant, "-o", path_str(&file)];
     typed.extend(of.iter().flat_map(|topic| ["--topic", topic]));
-    typed.extend(["--duration", "2s"]);
+    let duration = format!("{}s", scale_seconds(3));
+    typed.extend(["--duration", &*duration]);
     let mut summary = Value::Null;
     while_it_cries(robot, || {
         let said = daemon.deployer().types(&typed)?.succeeded()?.stdout;
@@ -94,13 +98,16 @@ fn a_recording_is_read_and_replayed(daemon: &Daemon, servant: &str, robot: &mut 
     // Replayed to another robot's servant, its node answers.
     let mut other = daemon.robot(&address(daemon, "other")?)?;
     other.subscribes("/greeting")?;
-    other.says(json!({"op": "publish", "topic": "/name", "type": "std_msgs/msg/String", "msg": {"data": "other"}}))?;
-    ensure!(other.hears_on("/greeting")?["text"] == "Hello, other");
+    let name = json!({"op": "publish", "topic": "/name", "type": "std_msgs/msg/String", "msg": {"data": "other"}});
+    let is_greeted = |text: &'static str| {
+        move |told: &Value| told["topic"] == "/greeting" && told["msg"]["text"] == text
+    };
+    other.says_until(&name, "a greeting", is_greeted("Hello, other"))?;
     let to = daemon.servant_of(HERALD.name, "other")?;
     let to = to["id"].as_str().context("an id")?.to_owned();
     let replay = ["replay", path_str(&file), "--to", &to, "--topic", "/name"];
     daemon.deployer().types(&replay)?.succeeded()?;
-    ensure!(other.hears_on("/greeting")?["text"] == "Hello, rover");
+    other.hears("a greeting of what is replayed", is_greeted("Hello, rover"))?;
     other.leaves()
 }
 

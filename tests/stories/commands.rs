@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use serde_json::Value;
 use support::daemon::Daemon;
 use support::deployer::{Outcome, run};
-use support::robot::PATIENCE;
+use support::patience;
 use support::world::{LOCALISER, world};
 use support::{Verdict, binaries};
 
@@ -116,7 +116,7 @@ impl Follower {
     fn until(&mut self, kind: &str) -> anyhow::Result<Vec<i64>> {
         let mut numbers = Vec::new();
         loop {
-            let line = self.lines.recv_timeout(PATIENCE);
+            let line = patience::receive(&self.lines);
             let line = line.with_context(|| format!("no event {kind:?} after {numbers:?}"))?;
             let event: Value = serde_json::from_str(&line)?;
             numbers.push(event["id"].as_i64().context("a number")?);
@@ -310,7 +310,7 @@ pub fn top_shows_who_uses_the_machine() -> Verdict {
             }
         }
     });
-    seen.recv_timeout(PATIENCE).context("nothing is drawn")?;
+    patience::receive(&seen).context("nothing is drawn")?;
     keys.write_all(b"mq")?;
     let ended = terminal.wait()?;
     let all = reader.join().map_err(|_| anyhow::anyhow!("the reader"))??;

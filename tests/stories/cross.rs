@@ -16,6 +16,7 @@ fn works_on(architecture: &str, emulator: &str) -> Verdict {
     let mut said = site.hears(&app, "/teller/said")?;
     let say = site.says(&app, "/teller/say", false)?;
     site.connected(&*say, 1).with_context(|| stub.said())?;
+    site.fed(&said, 1).with_context(|| stub.said())?;
     say.publish(string(architecture));
     let heard = site.next(&mut said).with_context(|| stub.said())?;
     ensure!(heard.bytes == string(architecture), "{heard:?}");

@@ -1,7 +1,6 @@
 //! What crosses the link beside plain messages: time, transforms, settings. Actions are told in [`crate::goals`].
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
@@ -13,7 +12,7 @@ use ros::schema::{MessageType, Registry};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::layout::Layout;
-use support::robot::PATIENCE;
+use support::patience::{Deadline, wait_for};
 use support::ros_system::Node;
 use support::site::{Running, Site, text_of};
 use support::twins::triggered;
@@ -226,17 +225,11 @@ pub fn answers(
     publish: impl Fn(),
     subscription: &mut Subscription,
 ) -> anyhow::Result<Message> {
-    let deadline = Instant::now() + PATIENCE;
-    while Instant::now() < deadline {
+    let ask = || {
         publish();
-        let next = site.runtime.block_on(async {
-            tokio::time::timeout(Duration::from_millis(200), subscription.messages.recv()).await
-        });
-        if let Ok(Some(message)) = next {
-            return Ok(message);
-        }
-    }
-    anyhow::bail!("there was no answer")
+        Ok(())
+    };
+    site.asks_until(subscription, ask, |_| Ok(true))
 }
 
 /// Publishes until this comes back as it was sent; others may come before it.
@@ -246,14 +239,12 @@ fn comes_back(
     subscription: &mut Subscription,
     sent: &Bytes,
 ) -> Verdict {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let came = answers(site, || points.publish(sent.clone()), subscription)?;
-        if is_same(&came.bytes, sent) {
-            return Ok(());
-        }
-        ensure!(Instant::now() < deadline, "{came:?} is not {sent:?}");
-    }
+    let ask = || {
+        points.publish(sent.clone());
+        Ok(())
+    };
+    site.asks_until(subscription, ask, |came| Ok(is_same(&came.bytes, sent)))
+        .map(drop)
 }
 
 /// Subscribes, and waits until the node's stub is connected.
@@ -265,7 +256,7 @@ pub fn listens(
     let mut subscription = site.hears(app, topic)?;
     let connected = site.runtime.block_on(async {
         let connected = subscription.matched.wait_for(|now| now.connected() > 0);
-        tokio::time::timeout(PATIENCE, connected).await.is_ok()
+        wait_for(connected).await.is_ok()
     });
     ensure!(connected, "nobody publishes {topic}");
     Ok(subscription)
@@ -334,17 +325,14 @@ pub fn simulated_time_is_the_robot_s(ros: RosVersion) -> Verdict {
     let mut seen = site.hears(&app, "/crossing/seen")?;
     // The clock stands until the next tick, so it is asked for, not waited for.
     let told = || Ok(triggered(&site, &app, "/crossing/now")?.1);
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     loop {
         let now = with_log(told(), &stub)?;
         if now == simulated.to_string() {
             break;
         }
-        let late = || anyhow::anyhow!("it is {now} in the cloud, and should be {simulated}");
-        with_log(
-            (Instant::now() < deadline).then_some(()).ok_or_else(late),
-            &stub,
-        )?;
+        let late = || format!("it is {now} in the cloud, and should be {simulated}");
+        with_log(deadline.check(late), &stub)?;
         tick();
     }
     let sent = point(ros, simulated - 1);
@@ -510,6 +498,10 @@ fn picture(number: u32) -> Vec<u8> {
     picture.0
 }
 
+/// So many pictures are shown at least, and so many of the last are carried as they are to be.
+pub const TRIED: u32 = 40;
+pub const SETTLED: usize = 5;
+
 pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
     let daemon = world().with(CROSSING)?;
     let types = types()?;
@@ -531,8 +523,25 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
         let say = || pictures.publish(first.clone().into());
         with_log(answers(&site, say, &mut mirrored), &stub)?;
         // The link has to be measured, and the codecs to be tried, before one is settled on.
+        let size = first.len() as u64;
         let mut carried = Vec::new();
-        for number in 1..=40 {
+        let settled = |carried: &[(u64, u64)]| {
+            let last = &carried[carried.len().saturating_sub(SETTLED)..];
+            let is = |bytes: u64| {
+                if smaller {
+                    bytes < size / 2
+                } else {
+                    bytes >= size
+                }
+            };
+            last.len() == SETTLED && last.iter().all(|(up, down)| is(*up) && is(*down))
+        };
+        let deadline = Deadline::begin();
+        let mut number = 0;
+        while number < TRIED || !settled(&carried) {
+            deadline
+                .check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
+            number += 1;
             let before = cable.carried()?;
             let sent = picture(number);
             pictures.publish(sent.clone().into());
@@ -546,18 +555,6 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             let after = cable.carried()?;
             carried.push((after.0 - before.0, after.1 - before.1));
         }
-        let size = first.len() as u64;
-        let last = &carried[carried.len() - 5..];
-        let all =
-            |holds: &dyn Fn(u64) -> bool| last.iter().all(|(up, down)| holds(*up) && holds(*down));
-        ensure!(
-            if smaller {
-                all(&|bytes| bytes < size / 2)
-            } else {
-                all(&|bytes| bytes >= size)
-            },
-            "codec {codec}: pictures of {size} bytes took {carried:?}"
-        );
     }
     Ok(())
 }

@@ -3,17 +3,20 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU32, AtomicUsize, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use ros::bus::{BusError, Graph, RosVersion, WireFormat};
 use support::Verdict;
 use support::cutter::Cutter;
 use support::daemon::Daemon;
-use support::robot::PATIENCE;
+use support::patience::{Deadline, patience, scale, wait_for};
 use support::site::{Site, string_of, text_of};
 use support::twins::{Twin, sum, sum_of};
 use support::world::world;
 
+/// After which nothing more is expected to come for now; another call is made then. Where nothing else runs.
+const PAUSE: Duration = Duration::from_millis(200);
 /// Callers at the same time.
 const CALLERS: usize = 4;
 /// The longest stretch between two cuts, bytes: some hundred calls. Many are in the midst of a handshake.
@@ -91,16 +94,9 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
     let mut sums = site.hears(&app, "/sums")?;
     // Both outputs are heard from here on.
     let next = Arc::new(AtomicI64::new(1));
-    loop {
-        site.calls(&app, "/add_two", &sum(ros, 0))?;
-        let heard = site.runtime.block_on(async {
-            let patience = std::time::Duration::from_millis(200);
-            tokio::time::timeout(patience, sums.messages.recv()).await
-        });
-        if heard.is_ok() {
-            break;
-        }
-    }
+    let ask = || site.calls(&app, "/add_two", &sum(ros, 0)).map(drop);
+    site.asks_until(&mut sums, ask, |_| Ok(true))
+        .with_context(said)?;
     names.publish(string_of(WireFormat::of(ros), "0"));
     site.next(&mut greetings).with_context(said)?;
     let before = [
@@ -118,7 +114,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
             let call = async || {
                 while !over() {
                     let number = next.fetch_add(1, Ordering::Relaxed);
-                    match app.call("/add_two", sum(ros, number), PATIENCE).await {
+                    match app.call("/add_two", sum(ros, number), patience()).await {
                         Ok(response) => {
                             let response = sum_of(ros, &response)?;
                             ensure!(response == number, "{response} is not {number}");
@@ -144,7 +140,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                 while !over() {
                     count += 1;
                     names.publish(string_of(WireFormat::of(ros), &count.to_string()));
-                    let greeting = tokio::time::timeout(PATIENCE, greetings.messages.recv()).await;
+                    let greeting = wait_for(greetings.messages.recv()).await;
                     let greeting = greeting
                         .ok()
                         .flatten()
@@ -168,9 +164,9 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                     if over() && done.load(Ordering::Relaxed) == CALLERS {
                         let number = next.fetch_add(1, Ordering::Relaxed);
                         fence.get_or_insert(number);
-                        app.call("/add_two", sum(ros, number), PATIENCE).await?;
+                        app.call("/add_two", sum(ros, number), patience()).await?;
                     }
-                    let pause = std::time::Duration::from_millis(200);
+                    let pause = scale(PAUSE);
                     while let Ok(Some(told)) =
                         tokio::time::timeout(pause, sums.messages.recv()).await
                     {
@@ -186,14 +182,11 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                 }
             };
             let all = async { tokio::try_join!(calls, greet, hear) };
-            let patience = PATIENCE * u32::try_from(cuts / 60 + 1).unwrap_or(1);
-            let ((), greeted, executed) =
-                tokio::time::timeout(patience, all)
-                    .await
-                    .with_context(|| {
-                        let cuts = cutter.cuts();
-                        format!("after {cuts} cuts {done:?} callers are done, {answered:?} answers")
-                    })??;
+            let deadline = Deadline::begin_many(u32::try_from(cuts / 60 + 1).unwrap_or(1));
+            let ((), greeted, executed) = deadline.limit(all).await.with_context(|| {
+                let cuts = cutter.cuts();
+                format!("after {cuts} cuts {done:?} callers are done, {answered:?} answers")
+            })??;
             anyhow::Ok((executed.len(), greeted))
         })
         .with_context(said)?;

@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
@@ -12,6 +13,7 @@ use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{path_str, run};
+use support::patience::patience;
 use support::robot::Robot;
 use support::world::{ADDER, world};
 use support::{Verdict, binaries};
@@ -20,8 +22,8 @@ use crate::access::token;
 
 /// What is wrong anywhere: an answer of 500 and above, or a status, type or value that the document does not have.
 const CHECKS: &str = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance";
-/// Seconds until an answer is there, on a busy machine.
-const ANSWERED: Duration = Duration::from_secs(60);
+/// Between two requests of a robot at work.
+const PAUSE: Duration = Duration::from_secs(1);
 /// Of the one who can sign in.
 const PASSWORD: &str = "four words of no sense";
 const NDJSON: &str = "application/x-ndjson";
@@ -138,7 +140,7 @@ impl Scene {
             .args(["--header", &format!("Authorization: Bearer {bearer}")])
             .args(["--checks", CHECKS, "--phases", "examples,coverage,fuzzing"])
             .args(["--seed", "1", "--continue-on-failure"])
-            .args(["--request-timeout", &ANSWERED.as_secs().to_string()])
+            .args(["--request-timeout", &patience().as_secs().to_string()])
             .args(["--generation-database", "none", "--warnings", "off"])
             .args(arguments);
         let said = run(&mut schemathesis)?.succeeded()?.stdout;
@@ -163,14 +165,24 @@ impl Scene {
 
     /// What goes on without an end begins as the document says.
     fn begins(&self, path: &str, media: &str, more: &[&str]) -> Verdict {
-        let heard = run(Command::new("curl")
-            .args(["--silent", "--no-buffer", "--include", "--max-time", "3"])
+        let mut curl = Command::new("curl")
+            .args(["--silent", "--show-error", "--no-buffer", "--include"])
+            .args(["--max-time", &patience().as_secs().to_string()])
             .args(["--header", &format!("Authorization: Bearer {}", self.admin)])
             .args(more)
-            .arg(format!("http://{}{path}", self.daemon.address)))?;
-        let head = heard.stdout.to_lowercase();
+            .arg(format!("http://{}{path}", self.daemon.address))
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let mut out = BufReader::new(curl.stdout.take().context("piped")?);
+        let mut head = String::new();
+        // An empty line ends it; nobody waits for what follows.
+        while out.read_line(&mut head)? > 2 {}
+        curl.kill()?;
+        curl.wait()?;
+        let head = head.to_lowercase();
         let is_begun = head.starts_with("http/1.1 200") && head.contains(media);
-        ensure!(is_begun, "{path}: {}", heard.said());
+        ensure!(is_begun, "{path}: {head}");
         Ok(())
     }
 
@@ -259,7 +271,7 @@ fn works(mut robot: Robot, over: &AtomicBool) {
     // It ends when its servant does.
     while !over.load(Ordering::Relaxed) && robot.calls("/add_two", json!({"a": 1, "b": 2})).is_ok()
     {
-        thread::sleep(Duration::from_secs(1));
+        thread::sleep(PAUSE);
     }
 }
 

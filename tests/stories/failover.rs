@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use bytes::Bytes;
 use ros::bus::{Message, RosVersion, Subscription};
 use support::Verdict;
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
+use support::patience::Deadline;
 use support::people::{self, Camera, picture_of};
-use support::robot::PATIENCE;
 use support::site::{Running, Site};
 use support::world::world;
 
@@ -109,13 +109,11 @@ impl Scene {
     /// Shows pictures that nobody answers in time until the local original is started, for so many times. Two suffice, unless one is answered all the same: by
     /// a local original that has not ended yet.
     fn asks_until_started(&mut self, times: usize) -> Verdict {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         self.asks();
         let mut next = Instant::now();
         while self.count("the local original is started") < times {
-            if Instant::now() > deadline {
-                bail!("{:?}\n{}", self.answers, self.stub.said());
-            }
+            deadline.check(|| format!("{:?}\n{}", self.answers, self.stub.said()))?;
             if Instant::now() >= next {
                 self.asks();
                 next += Duration::from_secs_f64(T_MAX + 1.0);
@@ -136,12 +134,10 @@ impl Scene {
     /// Shows pictures, not too many at once, until the local original has been stopped as often as it was started: pictures that gave way to newer ones while the
     /// network was slow are late one by one, and may start it once more.
     fn asks_until_stopped(&mut self) -> Verdict {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         let starts = |scene: &Self| scene.count("the local original is started");
         while self.count("the local original is stopped") < starts(self) {
-            if Instant::now() > deadline {
-                bail!("it should be stopped:\n{}", self.stub.said());
-            }
+            deadline.check(|| format!("it should be stopped:\n{}", self.stub.said()))?;
             let number = self.asks();
             self.hears(number)?;
             self.listens()?;
@@ -160,11 +156,9 @@ impl Scene {
 
     /// Shows pictures, one after the other is answered, until the stub has said this so many times.
     fn asks_until(&mut self, words: &str, times: usize) -> Verdict {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         while self.count(words) < times {
-            if Instant::now() > deadline {
-                bail!("it should say {words:?}:\n{}", self.stub.said());
-            }
+            deadline.check(|| format!("it should say {words:?}:\n{}", self.stub.said()))?;
             let number = self.asks();
             self.hears(number)?;
         }
@@ -202,17 +196,14 @@ impl Scene {
 
     /// Waits until the robot's diagnostics say this.
     fn diagnosed(&self, diagnostics: &mut Subscription, words: &str) -> Verdict {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         loop {
             let message = self.site.next(diagnostics)?;
-            ensure!(
-                Instant::now() < deadline,
-                "diagnostics should say {words:?}: {}",
-                String::from_utf8_lossy(&message.bytes)
-            );
-            if String::from_utf8_lossy(&message.bytes).contains(words) {
+            let said = String::from_utf8_lossy(&message.bytes);
+            if said.contains(words) {
                 return Ok(());
             }
+            deadline.check(|| format!("diagnostics should say {words:?}: {said}"))?;
         }
     }
 
@@ -504,7 +495,7 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
     let less = ["set", id, "--cpus", "0.05"];
     scene.daemon.deployer().types(&less)?.succeeded()?;
     // Each takes it half a tenth of a second of a whole core.
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     while !scene.explained()?["causes"]
         .to_string()
         .contains("held back by its CPU limit")
@@ -515,7 +506,7 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
             .camera
             .image
             .publish(picture_of(ros, scene.sent, (640, 480), &large));
-        ensure!(Instant::now() < deadline, "{:#}", scene.explained()?);
+        deadline.check(|| format!("{:#}", scene.explained().unwrap_or_default()))?;
     }
     // More at once than the link takes: all but the newest give way.
     for _ in 0..10 {

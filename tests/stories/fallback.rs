@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
@@ -12,11 +12,13 @@ use support::cable::{Badness, Cable};
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::layout::Layout;
+use support::patience::Deadline;
 use support::people;
-use support::robot::PATIENCE;
 use support::site::{Running, Site};
 use support::world::{LOCALISER, LOCALISER_TWO, Service, world};
 
+/// For how long a link is away that is back before anybody has to stand in: no wait, and so not longer on a busy machine.
+const BLIP: Duration = Duration::from_millis(50);
 const SILENT: Badness = Badness {
     rate: 100_000,
     delay: 1,
@@ -164,31 +166,26 @@ impl Robot {
     /// Shows scans of a cell until one is answered; the answer is right.
     fn is_found(&mut self, cell: (usize, usize), stub: &Running) -> Verdict {
         let wanted = [cell.0, cell.1].map(|at| (at as f64 + 0.5) * f64::from(RESOLUTION));
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            self.sent += 1;
-            self.shows(self.sent, cell);
-            let heard = self.site.runtime.block_on(async {
-                let pause = Duration::from_millis(100);
-                tokio::time::timeout(pause, self.poses.messages.recv()).await
-            });
-            if let Ok(Some(pose)) = heard {
-                let place = x_of(&pose);
-                let number = |at: usize| {
-                    let bytes = pose.bytes[place + at..place + at + 8].try_into();
-                    bytes.map(f64::from_le_bytes)
-                };
-                // Of an earlier cell's scans some may still be answered.
-                if [number(0)?, number(8)?] == wanted {
-                    return Ok(());
-                }
-            }
-            ensure!(
-                Instant::now() < deadline,
-                "{cell:?} should be found:\n{}",
-                stub.said()
-            );
-        }
+        let ros = self.site.system.version();
+        let (sent, scans) = (&mut self.sent, &self.scan);
+        let ask = || {
+            *sent += 1;
+            scans.publish(scan(ros, *sent, cell));
+            Ok(())
+        };
+        // Of an earlier cell's scans some may still be answered.
+        let is_there = |pose: &Message| -> anyhow::Result<bool> {
+            let place = x_of(pose);
+            let number = |at: usize| {
+                let bytes = pose.bytes[place + at..place + at + 8].try_into();
+                bytes.map(f64::from_le_bytes)
+            };
+            Ok([number(0)?, number(8)?] == wanted)
+        };
+        let found = self.site.asks_until(&mut self.poses, ask, is_there);
+        found
+            .map(drop)
+            .with_context(|| format!("{cell:?} should be found:\n{}", stub.said()))
     }
 }
 
@@ -199,14 +196,14 @@ fn says(stub: &Running, words: &str, times: usize) -> Verdict {
 
 /// Waits until a topic's message has these words.
 fn tells(site: &Site, subscription: &mut Subscription, words: &str) -> Verdict {
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     loop {
         let message = site.next(subscription)?;
         let said = String::from_utf8_lossy(&message.bytes).into_owned();
         if said.contains(words) {
             return Ok(());
         }
-        ensure!(Instant::now() < deadline, "{words:?}: {said}");
+        deadline.check(|| format!("{words:?}: {said}"))?;
     }
 }
 
@@ -316,10 +313,10 @@ pub fn a_promise_holds_without_a_server_too_until_it_comes(ros: RosVersion) -> V
     way.cut(false);
     says(&stub, "linked to", 1)?;
     // What nobody could answer in time has made it doubt the cloud: it is asked until it is trusted.
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     while !stub.said().contains("the local original is stopped") {
         robot.is_found((1, 1), &stub)?;
-        ensure!(Instant::now() < deadline, "{}", stub.said());
+        deadline.check(|| stub.said())?;
     }
     robot.is_found((2, 4), &stub)
 }
@@ -342,7 +339,7 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing(ros: RosVersion) -> V
             robot.shows(number, (1, 1));
         }
         way.cut(true);
-        std::thread::sleep(Duration::from_millis(50));
+        std::thread::sleep(BLIP);
         if round % 2 == 1 {
             robot.shows(number, (1, 1));
         }

@@ -5,6 +5,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::json;
 use support::Verdict;
+use support::patience::scale_seconds;
 use support::world::world;
 
 pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
@@ -22,7 +23,9 @@ pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
             .then_some(())
             .ok_or_else(|| status.to_string()))
     })?;
-    let mut robot = daemon.robot("adder_py?robot=one&rrt=500ms")?;
+    // Twice as long it hangs: before it is stopped it is not to be taken for that.
+    let rrt = scale_seconds(1);
+    let mut robot = daemon.robot(&format!("adder_py?robot=one&rrt={rrt}s"))?;
     let sum = json!({"a": 1, "b": 1});
     robot.calls("/add_two", sum.clone())?;
     let servant = daemon.servant_of("adder_py", "one")?;

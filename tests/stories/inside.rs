@@ -4,14 +4,14 @@ use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
 use std::thread;
-use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::binaries;
 use support::daemon::{Daemon, Setup};
-use support::robot::{PATIENCE, Refusal, Robot};
+use support::patience::{self, Deadline};
+use support::robot::{Refusal, Robot};
 use support::world::world;
 use tokio_tungstenite::tungstenite::Message;
 
@@ -118,7 +118,7 @@ pub fn refused(connection: Result<Robot, Refusal>, status: u16, words: &str) -> 
 /// Waits for a picture in binary, which is as large as it was published.
 pub fn hears_a_picture(robot: &mut Robot) -> Verdict {
     loop {
-        if let Message::Binary(bytes) = robot.frame(PATIENCE)? {
+        if let Message::Binary(bytes) = robot.frame()? {
             ensure!(bytes.len() > 640 * 480 * 3, "{} bytes", bytes.len());
             return Ok(());
         }
@@ -148,13 +148,15 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     scene
         .rover
         .says(json!({"op": "advertise", "topic": "/sights/say", "type": "std_msgs/String"}))?;
-    // She hears from when her node is connected on, and the robot does not wait for that.
-    support::until("what the robot sends, inside", || {
+    // She hears from when her node is connected on, and the robot does not wait for that; the node's own words later yet.
+    support::until("what the robot sends and its node says, inside", || {
         scene.rover.says(say("by rover"))?;
-        let unheard = eve.has_not_heard(|said| said["topic"] == "/sights/say")?;
-        Ok((!unheard)
-            .then_some(())
-            .ok_or_else(|| "not heard".to_owned()))
+        for topic in ["/sights/say", "/sights/said"] {
+            if eve.has_not_heard(|said| said["topic"] == topic)? {
+                return Ok(Err(format!("{topic} is not heard")));
+            }
+        }
+        Ok(Ok(()))
     })?;
     ensure!(eve.hears_on("/sights/say")?["data"] == "by rover");
     ensure!(eve.hears_on("/sights/said")?["data"] == "by rover");
@@ -427,12 +429,12 @@ impl Counting {
 
     /// The topics of the first line that is so.
     fn tells(&self, is: impl Fn(&[Value]) -> bool) -> anyhow::Result<Vec<Value>> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         let mut last = String::new();
         loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            let line = self.lines.recv_timeout(left);
+            let line = patience::receive(&self.lines);
             last = line.with_context(|| format!("no line is so, the last is {last}"))?;
+            deadline.check(|| format!("no line is so, the last is {last}"))?;
             let mut told: Value = serde_json::from_str(&last)?;
             let topics: Vec<Value> = serde_json::from_value(told["topics"].take())?;
             if is(&topics) {
@@ -628,7 +630,7 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
     drop(rover);
     let (ended, end) = mpsc::channel();
     thread::spawn(move || ended.send(daemon.ends()));
-    let ended = end.recv_timeout(PATIENCE);
+    let ended = patience::receive(&end);
     ended.context("the daemon waits for those who are told of a servant")??;
     drop(counting);
     // What it has left goes on; the next one ends it.

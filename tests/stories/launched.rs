@@ -15,15 +15,17 @@ launch() {{
   roslaunch -p {port} "$1" > "$1.log" 2>&1 &
   launched=$!
   until rosparam list > /dev/null 2>&1; do kill -0 $launched || {{ cat "$1.log"; exit 1; }}; sleep 0.1; done
-  exec 3< <(exec timeout 100 rostopic echo -p /told 2> /dev/null)
+  exec 3< <(exec timeout "$PATIENCE" rostopic echo -p /told 2> /dev/null)
 }}
 told() {{
-  while read -r -t 60 -u 3 line; do
+  while read -r -t "$PATIENCE" -u 3 line; do
     case $line in *,life*) echo "${{line#*,}}"; return ;; esac
   done
   echo "nothing was told"; cat /root/*.log; exit 1
 }}
-ends() {{ timeout 60 rostopic pub -1 /front/teller/end std_msgs/Int32 "$1" > /dev/null 2>&1; }}
+# Until it is heard: of another life than the one that is meant a number ends nothing.
+ends() {{ rostopic pub -r 2 /front/teller/end std_msgs/Int32 "$1" > /dev/null 2>&1 & saying=$!; }}
+ended() {{ kill $saying 2> /dev/null; wait $saying 2> /dev/null; }}
 "#
     )
 }
@@ -64,6 +66,7 @@ echo "rosnode kill"; rosnode kill /front/teller > /dev/null
 told
 echo "exit code 3"; ends 2
 told
+ended
 echo "SIGINT to roslaunch"; kill -INT $launched
 wait $launched; echo "roslaunch ended with $?"
 grep -o 'has died.*exit code [0-9-]*' /root/respawn.launch.log | sed 's/pid [0-9]*/pid/'
@@ -75,6 +78,7 @@ launch /root/required.launch
 told
 ends 1
 wait $launched; echo "roslaunch ended with $?"
+ended
 grep -o 'REQUIRED process' /root/required.launch.log
 grep -o 'has died.*exit code [0-9-]*' /root/required.launch.log | sed 's/pid [0-9]*/pid/' | sort -u
 pgrep -fa '[l]ib/teller_py'
@@ -129,7 +133,7 @@ printf '[nodes]\n"teller.py" = "usual_name"\n' >> /opt/cloudroid/share/teller_py
 rosmaster --core -p ${{ROS_MASTER_URI##*:}} > /dev/null 2>&1 & master=$!
 until rosparam list > /dev/null 2>&1; do kill -0 $master || exit 1; sleep 0.1; done
 CLOUDROID_LOCAL=none rosrun teller_py teller.py > said 2>&1 &
-timeout 60 rostopic echo -n 1 -p /usual_name/told || cat said
+timeout "$PATIENCE" rostopic echo -n 1 -p /usual_name/told || cat said
 find /opt/cloudroid -name teller.py -perm /111
 "#,
         prelude(free_port()?, "")
@@ -167,8 +171,9 @@ cat > /root/promises.launch << 'END'
 </launch>
 END
 cat > /root/explained.py << 'END'
-import json, sys, time, urllib.error, urllib.request
-for attempt in range(600):
+import json, os, sys, time, urllib.error, urllib.request
+end = time.monotonic() + float(os.environ["PATIENCE"])
+while time.monotonic() < end:
     try:
         with urllib.request.urlopen(sys.argv[1]) as answer:
             explained = json.load(answer)
@@ -201,10 +206,8 @@ cat > /root/nonsense.launch << 'END'
 </launch>
 END
 roslaunch -p PORT /root/nonsense.launch > /root/log 2>&1 & launched=$!
-for attempt in $(seq 300); do
-  [ "$(grep -c 'has died' /root/log)" = 5 ] && break
-  sleep 0.1
-done
+end=$((SECONDS + PATIENCE))
+until [ "$(grep -c 'has died' /root/log)" = 5 ] || [ $SECONDS -ge $end ]; do sleep 0.1; done
 kill -INT $launched; wait $launched
 cat /root/log
 "#;

@@ -1,20 +1,21 @@
 //! A servant of ROS 2 with several nodes: one with a lifecycle, which works for its robot once it is active, and two that pass pictures
 //! to each other by shared memory. All of it is one story, since a push of ROS 2 takes long.
 
+use std::cell::Cell;
 use std::collections::BTreeSet;
 use std::os::unix::fs::MetadataExt;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use nix::sys::stat::{major, minor};
-use ros::bus::{Bus, Publisher, RosVersion, Subscription, WireFormat};
+use ros::bus::{Bus, Message, Publisher, RosVersion, Subscription, WireFormat};
 use ros::ros2::lifecycle::{LifecycleNode, State, StateChange, Transition};
 use serde_json::{Value, json};
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::deployer::path_str;
-use support::robot::{PATIENCE, Robot};
+use support::patience::{patience, wait_for};
+use support::robot::Robot;
 use support::site::{Running, Site, string_of};
 use support::world::world;
 use support::{Verdict, procfs};
@@ -213,9 +214,9 @@ impl Guarded {
             let mut changes = node.watch().await?;
             for (transition, [from, by, to]) in way {
                 ensure!(node.state().await? == *from);
-                node.change(*transition, PATIENCE).await?;
+                node.change(*transition, patience()).await?;
                 for (from, to) in [(*from, *by), (*by, *to)] {
-                    let told = tokio::time::timeout(PATIENCE, changes.next()).await;
+                    let told = wait_for(changes.next()).await;
                     let told = told.context("its state's change should be told")?;
                     ensure!(told == Some(StateChange { from, to }), "{told:?}");
                 }
@@ -227,20 +228,27 @@ impl Guarded {
 
     /// Makes noise until an alarm of it is heard: on which host it was raised.
     fn alarmed(&mut self) -> anyhow::Result<String> {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            self.noises += 1;
-            let noise = format!("noise {}", self.noises);
+        let (noises, begun) = (Cell::new(self.noises), self.noises);
+        let ask = || {
+            noises.set(noises.get() + 1);
+            let noise = format!("noise {}", noises.get());
             self.noise.publish(string_of(WireFormat::Cdr, &noise));
-            let pause = Duration::from_millis(200);
-            while let Some(alarm) = self.site.next_within(&mut self.alarms, pause)? {
-                let said = String::from_utf8_lossy(&alarm.bytes).into_owned();
-                if let Some((_, host)) = said.split_once(&format!("{noise} heard by ")) {
-                    return Ok(host.trim_end_matches('\0').to_owned());
-                }
-            }
-            ensure!(Instant::now() < deadline, "an alarm should be heard");
-        }
+            Ok(())
+        };
+        let mut raised = None;
+        // One of noise that was made before says nothing of who raises alarms now.
+        let is_of_now = |alarm: &Message| {
+            let said = String::from_utf8_lossy(&alarm.bytes).into_owned();
+            raised = (begun + 1..=noises.get()).find_map(|number| {
+                let (_, host) = said.split_once(&format!("noise {number} heard by "))?;
+                Some(host.trim_end_matches('\0').to_owned())
+            });
+            Ok(raised.is_some())
+        };
+        let heard = self.site.asks_until(&mut self.alarms, ask, is_of_now);
+        heard.context("an alarm should be heard")?;
+        self.noises = noises.get();
+        raised.context("a host")
     }
 }
 

@@ -8,6 +8,7 @@ use ros::bus::{Bus, GlobalParameters, Graph, ParamValue, RosVersion, WireFormat}
 use ros::ros1::Ros1Bus;
 use support::Verdict;
 use support::freezer::Freezer;
+use support::patience::scale_seconds;
 use support::site::{Running, Site, registered, string, string_of, text_of};
 use support::twins::{Twin, count, sum};
 use support::world::{GREETER, PEOPLE, world};
@@ -384,8 +385,9 @@ pub fn a_connection_that_falls_silent_is_replaced(ros: RosVersion) -> Verdict {
     let robot = twin.robot("linked-silent");
     let argv = twin.argv("greeter", &[("~name", "/who")]);
     // It would be given up ten times T_max after it fell silent.
-    let settings = "desire = 1.0\nmax = 2.0\n";
-    let stub = twin.stub(&site, (&server, &robot), settings, &argv)?;
+    let max = scale_seconds(2);
+    let settings = format!("desire = 1.0\nmax = {max}.0\n");
+    let stub = twin.stub(&site, (&server, &robot), &settings, &argv)?;
     with_log(
         site.until(&app, "the service", serves("/greeter/count")),
         &stub,

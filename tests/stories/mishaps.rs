@@ -3,7 +3,6 @@
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use nix::sys::signal::{Signal, kill};
@@ -279,15 +278,12 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
             "{said}"
         );
     }
-    let told = daemon.deployer().asks(&["explain", robot])?;
-    let events = told["events"].as_array().context("events")?;
-    ensure!(
-        events
-            .iter()
-            .any(|event| event["kind"] == "duplicate-robot"),
-        "{told:#}"
-    );
-    Ok(())
+    let path = format!("/api/v1/robots/{robot}/explain");
+    daemon.awaits(&path, "an event of two robots", |told| {
+        let mut events = told["events"].as_array()?.iter();
+        let told = events.any(|event| event["kind"] == "duplicate-robot");
+        told.then_some(())
+    })
 }
 
 pub fn parameters_that_cannot_be_carried_are_named_and_the_others_arrive() -> Verdict {
@@ -314,7 +310,7 @@ END
 python3 poison.py $ROS_MASTER_URI
 ! rosparam get / > /dev/null 2>&1
 rosrun teller_py teller.py > said 2>&1 & node=$!
-timeout 60 rostopic echo -n 1 -p /teller/told
+timeout "$PATIENCE" rostopic echo -n 1 -p /teller/told
 # The robot's Master starts again, and the node is there again.
 kill -9 $master; wait $master || true
 rosmaster --core -p {port} > /dev/null 2>&1 &
@@ -363,6 +359,7 @@ pub fn a_missing_original_is_said_once_and_the_cloud_goes_on(ros: RosVersion) ->
         names.publish(name);
         site.next(&mut greetings).with_context(|| stub.said())?;
     }
+    stub.says("there is no local original")?;
     let said = stub.said();
     let times = said.matches("there is no local original").count();
     ensure!(times == 1, "{times} times: {said}");
@@ -401,13 +398,14 @@ fn is_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &Running) -> Verdict {
     let names = site.says(app, "/who", false)?;
     let mut greetings = site.hears(app, "/greeter/greeting")?;
     let mut number = 0;
-    support::until("a greeting", || {
+    let ask = || {
         number += 1;
         let name = format!("robot {number}");
         names.publish(string_of(WireFormat::of(site.system.version()), &name));
-        let heard = site.next_within(&mut greetings, Duration::from_millis(200))?;
-        Ok(heard.map(drop).ok_or_else(|| stub.said()))
-    })
+        Ok(())
+    };
+    let greeted = site.asks_until(&mut greetings, ask, |_| Ok(true));
+    greeted.map(drop).with_context(|| stub.said())
 }
 
 /// The original that a stub has started, once it is more than the shell that starts it.
@@ -470,7 +468,7 @@ roslaunch -p PORT /root/one.launch > log 2>&1 & launched=$!
 original() { pgrep -f '[p]ython3 /usr/lib/teller_py'; }
 until original > /dev/null; do kill -0 $launched; sleep 0.1; done
 first=$(original)
-timeout 60 rostopic echo -n 1 -p /front/teller/told
+timeout "$PATIENCE" rostopic echo -n 1 -p /front/teller/told
 stub=$(pgrep -f '[c]loudroid-stub run')
 echo "same group: $([ $(ps -o pgid= $first) = $(ps -o pgid= $stub) ] && echo yes)"
 echo "namespace: $(tr '\0' '\n' < /proc/$first/environ | grep ^ROS_NAMESPACE)"
@@ -481,7 +479,7 @@ until original | grep -qv "^$first$"; do kill -0 $stub; sleep 0.1; done
 echo "another runs"
 last=$(pgrep -f '[c]loudroid-stub run')
 kill -9 $last
-timeout 60 sh -c 'while pgrep -f "[p]ython3 /usr/lib/teller_py" > /dev/null; do sleep 0.1; done'
+timeout "$PATIENCE" sh -c 'while pgrep -f "[p]ython3 /usr/lib/teller_py" > /dev/null; do sleep 0.1; done'
 echo "it ends with a stub that is killed"
 kill -INT $launched || true; wait $launched || true
 pgrep -fa '[p]ython3 /usr/lib/teller_py|[c]loudroid-stub run' || echo "none is left"

@@ -10,6 +10,7 @@ use serde_json::json;
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::machine::Machine;
+use support::patience::tell_patience;
 use support::world::{ADDER, PEOPLE, TELLER, world};
 use support::{Verdict, binaries};
 
@@ -25,7 +26,8 @@ struct Adder(Child);
 impl Adder {
     /// Returns once it has a sum.
     fn begins(url: &str) -> anyhow::Result<Adder> {
-        let child = Command::new(binaries::python())
+        let mut adds = Command::new(binaries::python());
+        let child = tell_patience(&mut adds)
             .arg(binaries::checkout().join("tests/robots/adds_with_roslibpy.py"))
             .arg(url)
             .stdin(Stdio::piped())
@@ -70,7 +72,8 @@ fn begins_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Res
 fn goes(daemon: &Daemon, url: &str, step: &str, token: &str) -> Command {
     let checkout = binaries::checkout();
     let mut node = Command::new("node");
-    node.arg(checkout.join("tests/web/page.cjs"))
+    tell_patience(&mut node)
+        .arg(checkout.join("tests/web/page.cjs"))
         .args([step, url])
         .arg(checkout.join("target/web"))
         .arg(token)
@@ -187,14 +190,8 @@ with rosbag.Bag("/root/talk.bag", "w") as bag:
     robot.awaits_subscriber("/teller/say")?;
     let say = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "hello"}});
     // What it says before the node has connected to the robot is not heard.
-    support::until("what it says", || {
-        robot.says(say.clone())?;
-        let silent = robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
-        Ok(if silent {
-            Err("nothing yet".to_owned())
-        } else {
-            Ok(())
-        })
+    robot.says_until(&say, "what it says", |value| {
+        value["topic"] == "/teller/said"
     })?;
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {

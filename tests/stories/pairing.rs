@@ -10,6 +10,7 @@ use anyhow::{Context, ensure};
 use support::daemon::{Daemon, Setup};
 use support::deployer::{Outcome, path_str, run};
 use support::machine::Machine;
+use support::patience::{patience, scale_seconds};
 use support::site::{Running, Site};
 use support::world::{ADDER, TELLER, world};
 use support::{Verdict, binaries, until};
@@ -92,7 +93,7 @@ fn curl(
             "--silent",
             "--show-error",
             "--max-time",
-            "60",
+            &patience().as_secs().to_string(),
             "--write-out",
             "\n%{http_code}",
         ])
@@ -201,6 +202,7 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
             &daemon.address,
             path_str(&certificate),
             path_str(&key),
+            &patience().as_secs().to_string(),
         ])
         .stdout(Stdio::piped())
         .spawn()?;
@@ -263,7 +265,7 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
 /// Opens an idle connection of the API and one of rosbridge with a certificate, and tells when each ends.
 const WATCH: &str = r#"
 import base64, socket, ssl, struct, sys, threading, time
-address, certificate, key = sys.argv[1:]
+address, certificate, key, patience = sys.argv[1:]
 host, port = address.rsplit(":", 1)
 context = ssl.create_default_context()
 context.check_hostname = False
@@ -271,7 +273,7 @@ context.verify_mode = ssl.CERT_NONE
 context.load_cert_chain(certificate, key)
 def connect(head):
     tls = context.wrap_socket(socket.create_connection((host, int(port))), server_hostname="localhost")
-    tls.settimeout(120)
+    tls.settimeout(float(patience))
     tls.sendall((head + "Host: " + address + "\r\n\r\n").encode())
     file = tls.makefile("rb")
     status = file.readline()
@@ -326,7 +328,8 @@ for thread in threads:
 "#;
 
 pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict {
-    let daemon = secure("renewing", "robot_certificates = \"6s\"\n").start()?;
+    let good_for = format!("robot_certificates = \"{}s\"\n", scale_seconds(6));
+    let daemon = secure("renewing", &good_for).start()?;
     let deployer = daemon.deployer();
     deployer
         .pushes(TELLER.name, TELLER.arguments)?

@@ -1,14 +1,14 @@
 //! Nodes that wait for their robot before they show all of themselves.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{Bus, ServiceHandler, ServiceType, reaches};
 use support::Verdict;
-use support::robot::PATIENCE;
+use support::patience::{Deadline, scale};
 use support::site::Site;
 use support::world::world;
 
@@ -100,21 +100,19 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
         transforms.publish(transform.clone());
         scans.publish(scan.clone());
     };
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     let there = || {
         let connected = reaches(goals.matched(), 1);
-        let wait = async { tokio::time::timeout(Duration::from_millis(200), connected).await };
+        let moment = scale(Duration::from_millis(200));
+        let wait = async { tokio::time::timeout(moment, connected).await };
         site.runtime.block_on(wait).is_ok()
     };
     while !there() {
-        if Instant::now() >= deadline {
-            let node = daemon.deployer().types(&["logs", "patient_py"])?;
-            bail!(
-                "no action came: {}\nthe node said: {}",
-                stub.said(),
-                node.said()
-            );
-        }
+        deadline.check(|| {
+            let node = daemon.deployer().types(&["logs", "patient_py"]);
+            let node = node.map_or_else(|error| error.to_string(), |node| node.said());
+            format!("no action came: {}\nthe node said: {node}", stub.said())
+        })?;
         gives();
     }
     let mut results = listens(&site, &app, "/move_base/result")?;

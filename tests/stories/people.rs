@@ -7,6 +7,7 @@ use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{Outcome, path_str, run};
+use support::patience::patience;
 use support::robot::Robot;
 use support::world::world;
 use support::{Verdict, binaries, until};
@@ -435,7 +436,8 @@ pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
     let own = daemon.home.join("tls/own.pem");
     let asks = |more: &[&str], path: &str| {
         run(Command::new("curl")
-            .args(["--silent", "--show-error", "--include", "--max-time", "60"])
+            .args(["--silent", "--show-error", "--include", "--max-time"])
+            .arg(patience().as_secs().to_string())
             .args(["--cacert", path_str(&own)])
             .args(more)
             .arg(format!("{site}{path}")))?

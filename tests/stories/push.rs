@@ -7,6 +7,7 @@ use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{path_str, run};
+use support::patience::tell_patience;
 use support::world::{ADDER, GREETER, world};
 use support::{Verdict, binaries};
 
@@ -510,7 +511,7 @@ pub fn a_revision_is_rolled_back() -> Verdict {
 
 pub fn five_packaged_nodes_answer() -> Verdict {
     let daemon = world().shared()?;
-    let outcome = run(Command::new(binaries::python())
+    let outcome = run(tell_patience(&mut Command::new(binaries::python()))
         .arg(binaries::checkout().join("tests/robots/packaged_nodes.py"))
         .arg(&daemon.address)
         .arg(binaries::path("cloudroidctl"))

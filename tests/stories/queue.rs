@@ -1,14 +1,13 @@
 //! Robots before a machine that is full: who goes first, and what each is told.
 
 use std::io::{Read, Write};
-use std::net::TcpStream;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::PATIENCE;
+use support::patience::{connect, scale_seconds};
 use support::world::{GREETER, world};
 
 /// Between looks at what a push has come to.
@@ -29,8 +28,7 @@ fn full(name: &str, config: &str) -> anyhow::Result<Daemon> {
 
 /// The status of the answer to a stub's handshake, and its head.
 fn stub_is_answered(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
-    let mut stream = TcpStream::connect(&daemon.address)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+    let mut stream = connect(&daemon.address)?;
     write!(
         stream,
         "GET /greeter_cpp?robot={robot} HTTP/1.1\r\nHost: {}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
@@ -51,7 +49,9 @@ fn stub_is_answered(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
 }
 
 pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdict {
-    let daemon = full("queue", "queue = 1\ndeadline = \"2s\"")?;
+    // While the second waits, the third has to come.
+    let waits = scale_seconds(5);
+    let daemon = full("queue", &format!("queue = 1\ndeadline = \"{waits}s\""))?;
     let mut first = daemon.robot("greeter_cpp?robot=first")?;
     first.calls("/rosapi/get_time", json!({}))?;
     // It speaks rosbridge alone.
@@ -62,7 +62,8 @@ pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdi
     let told = third.hears_status("1 robots wait for room already")?;
     ensure!(told["level"] == "error", "{told}");
     ensure!(u16::from(third.hears_close()?.code) == 1013);
-    let told = second.hears_status("no room came free within 2 s; it was number 1 of 1")?;
+    let words = format!("no room came free within {waits} s; it was number 1 of 1");
+    let told = second.hears_status(&words)?;
     ensure!(told["level"] == "error", "{told}");
     ensure!(u16::from(second.hears_close()?.code) == 1013);
     // A stub reads the status of the handshake.

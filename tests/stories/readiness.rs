@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use serde_json::json;
 use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::{PATIENCE, Robot};
+use support::robot::Robot;
 use support::world::world;
 use tokio_tungstenite::tungstenite::Message;
 
@@ -60,10 +60,10 @@ pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Verdict {
     let _node = registered(&models)?;
     // There is nothing for it yet, and it is heard all the same.
     robot.sends(Message::Ping("are you there".into()))?;
-    let pong = robot.frame(PATIENCE)?;
+    let pong = robot.frame()?;
     ensure!(pong == Message::Pong("are you there".into()), "{pong:?}");
     robot.sends(Message::Close(None))?;
-    let closed = robot.frame(PATIENCE)?;
+    let closed = robot.frame()?;
     ensure!(closed == Message::Close(None), "{closed:?}");
     // Nobody can come back to its servant: it is not started to its end.
     daemon.awaits_event("a servant's end before it was ready", |event| {
@@ -79,7 +79,7 @@ pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Verdict {
     robot.says(json!({"op": "subscribe", "topic": "/answers", "type": "std_msgs/String"}))?;
     robot.says(json!({"op": "publish", "topic": "/questions", "msg": {"data": "early"}}))?;
     robot.sends(Message::Ping("still there".into()))?;
-    let pong = robot.frame(PATIENCE)?;
+    let pong = robot.frame()?;
     ensure!(pong == Message::Pong("still there".into()), "{pong:?}");
     ensure!(daemon.servant_of("slow_py", "eager")?["phase"] == "starting");
     node.write_all(b"2")?;

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::binaries;
 use support::deployer::{path_str, run};
+use support::patience::{scale_seconds, tell_patience};
 use support::world::world;
 
 use crate::access::token;
@@ -38,9 +39,11 @@ impl Talker {
         let url = scene
             .daemon
             .url(&format!("sights_py?token={}", scene.token));
-        let mut child = Command::new(binaries::python())
+        let mut talks = Command::new(binaries::python());
+        talks
             .arg(binaries::checkout().join("tests/robots/talks_with_roslibpy.py"))
-            .arg(url)
+            .arg(url);
+        let mut child = tell_patience(&mut talks)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()?;
@@ -79,6 +82,8 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     let place = world().directory("recordings")?;
     let file = place.path().join("said.mcap");
     let talker = Talker::begins(&scene)?;
+    // Long enough for all topics to be connected, and for some words.
+    let duration = format!("{}s", scale_seconds(3));
     let typed = [
         "--format",
         "json",
@@ -91,7 +96,7 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
         "--topic",
         "/sights/map",
         "--duration",
-        "3s",
+        &duration,
     ];
     let outcome = scene.daemon.deployer().types(&typed)?.succeeded()?;
     let summary: Value = serde_json::from_str(&outcome.stdout)?;
@@ -466,7 +471,15 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         })?;
     }
     // Nobody takes one after the other.
-    let soon = take()?.failed_saying(&["a moment ago"])?;
+    let soon = support::until("a refusal", || {
+        let taken = take()?;
+        Ok(if taken.status == 0 {
+            Err("this machine took its time to ask again".to_owned())
+        } else {
+            Ok(taken)
+        })
+    })?;
+    let soon = soon.failed_saying(&["a moment ago"])?;
     ensure!(soon.status == 7, "{}", soon.status);
     let all = listed(&[])?;
     ensure!(

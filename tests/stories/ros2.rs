@@ -20,16 +20,17 @@ use serde_json::{Value, json};
 use support::cable::{Badness, Cable};
 use support::daemon::Daemon;
 use support::layout::Layout;
+use support::patience::{Deadline, scale, tell_patience, wait_for};
 use support::people::{self, Camera};
-use support::robot::PATIENCE;
 use support::site::{Running, Site, string_of};
 use support::world::{ADDER, HERALD, SEER, world};
 use support::{Verdict, binaries};
 use tokio::sync::Notify;
 
+use crate::crossing::{SETTLED, TRIED};
 use crate::push::extract_install_space;
 
-/// For an answer that may never come.
+/// For an answer that may never come; where nothing else runs.
 const MEANWHILE: Duration = Duration::from_secs(5);
 const THE_HERALD: (&str, &str, &str) = ("herald", "herald", "herald");
 
@@ -70,8 +71,9 @@ pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
     );
     robot.says(json!({"op": "subscribe", "topic": "/greeting", "qos": {"reliability": "reliable", "depth": 5}}))?;
     robot.says(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String"}))?;
-    robot.says(json!({"op": "publish", "topic": "/name", "msg": {"data": "crowd"}}))?;
-    ensure!(robot.hears_on("/greeting")?["text"] == "Hello, crowd");
+    let crowd = json!({"op": "publish", "topic": "/name", "msg": {"data": "crowd"}});
+    let greeted = robot.says_until(&crowd, "a greeting", |told| told["topic"] == "/greeting")?;
+    ensure!(greeted["msg"]["text"] == "Hello, crowd", "{greeted}");
     robot.says(
         json!({"op": "send_action_goal", "id": "goal", "action": "/count",
         "action_type": "herald_msgs/action/Count", "args": {"to": 3}, "feedback": true}),
@@ -197,10 +199,10 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
         let (image, found) = (format!("{above}/image"), format!("{above}/found"));
         robot.subscribes(&found)?;
         robot.says(json!({"op": "advertise", "topic": image, "type": "std_msgs/msg/String"}))?;
-        robot.says(json!({"op": "publish", "topic": image, "msg": {"data": "view"}}))?;
-        let heard = robot.hears_on(&found)?;
+        let view = json!({"op": "publish", "topic": image, "msg": {"data": "view"}});
+        let heard = robot.says_until(&view, "what it finds", |told| told["topic"] == *found)?;
         let expected = format!("a cat in view by {above}/{name}");
-        ensure!(heard["data"] == expected, "{heard}");
+        ensure!(heard["msg"]["data"] == expected, "{heard}");
     }
     robot.leaves()?;
     // On a robot: where its program is, unless a rule says otherwise.
@@ -269,7 +271,7 @@ fn counts(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
     let goal = Layout::of(RosVersion::Two).u32(to).finish();
     client.send("goal", goal, events);
     site.runtime.block_on(async {
-        let ended = tokio::time::timeout(PATIENCE, heard.ended.notified());
+        let ended = wait_for(heard.ended.notified());
         ended.await.context("a result should come")
     })?;
     let end = heard.end.lock().take().context("an end")?;
@@ -421,7 +423,9 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     let mut command = Command::new(binaries::ros2().join("bin/python"));
     command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
     site.system.is_of(&mut command);
-    command.stdin(Stdio::piped()).stdout(Stdio::piped());
+    tell_patience(&mut command)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped());
     let mut application = command.spawn()?;
     let mut told = String::new();
     BufReader::new(application.stdout.as_mut().context("piped")?).read_line(&mut told)?;
@@ -499,7 +503,7 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
     daemon.is_killed()?;
     let daemon = setup.listen(&address).start()?;
     // A call made meanwhile is answered, or forgotten, of which DDS has no way to tell its caller; the next one is answered.
-    let meanwhile = app.call("/greet", request.clone(), MEANWHILE);
+    let meanwhile = app.call("/greet", request.clone(), scale(MEANWHILE));
     match site.runtime.block_on(meanwhile) {
         Ok(_) | Err(BusError::Timeout { .. }) => {}
         Err(other) => return Err(other.into()),
@@ -555,8 +559,25 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
         let stub = people::stub(&site, &daemon, &cable, (SEER.name, &robot), &settings, &[])?;
         let mut camera = with_log(Camera::new(&site, 10), &stub)?;
         // The link has to be measured, and the codecs to be tried, before one is settled on.
-        let mut carried = Vec::new();
-        for number in 1..=40 {
+        let size = u64::from(SIZE.0 * SIZE.1 * 3);
+        let mut carried: Vec<u64> = Vec::new();
+        let settled = |carried: &[u64]| {
+            let last = &carried[carried.len().saturating_sub(SETTLED)..];
+            let is = |bytes: &u64| {
+                if smaller {
+                    *bytes < size * 2 / 5
+                } else {
+                    *bytes >= size
+                }
+            };
+            last.len() == SETTLED && last.iter().all(is)
+        };
+        let deadline = Deadline::begin();
+        let mut number = 0;
+        while number < TRIED || !settled(&carried) {
+            deadline
+                .check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
+            number += 1;
             let before = cable.carried()?.0;
             let pixels = wall(number, SIZE);
             let picture = people::picture_of(RosVersion::Two, number, SIZE, &pixels);
@@ -566,15 +587,6 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             ensure!(people::number(&found) == Some(number), "{found:?}");
             carried.push(cable.carried()?.0 - before);
         }
-        let size = u64::from(SIZE.0 * SIZE.1 * 3);
-        let last = &carried[carried.len() - 5..];
-        ensure!(
-            last.iter().all(|bytes| match smaller {
-                true => *bytes < size * 2 / 5,
-                false => *bytes >= size,
-            }),
-            "codec {codec}: pictures of {size} bytes took {carried:?}"
-        );
     }
     Ok(())
 }

@@ -111,7 +111,7 @@ pub fn without_the_original_the_stub_stands_alone() -> Verdict {
     machine
         .runs(
             "sh",
-            &format!("{source}timeout 60 rosrun opencv_apps face_detection"),
+            &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
         )?
         .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
     let doctor = machine.runs(
@@ -209,7 +209,7 @@ pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Verd
         machine
             .runs(
                 shell,
-                &format!("{source}timeout 60 rosrun opencv_apps face_detection"),
+                &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
             )?
             .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
         let doctor = format!("{source}rosrun opencv_apps cloudroid-stub doctor");
@@ -327,7 +327,7 @@ cat > load.launch << 'END'
   <node pkg="nodelet" type="nodelet" name="people" args="load opencv_apps/people_detect manager" output="screen" required="true"/>
 </launch>
 END
-timeout 60 roslaunch load.launch || echo "roslaunch: $?""#
+timeout "$PATIENCE" roslaunch load.launch || echo "roslaunch: $?""#
     );
     let refused = machine.runs("bash", &script)?.succeeded()?;
     // In a process of its own, and in a manager that a launch file starts: there the loader ends, and is missed.

@@ -9,7 +9,7 @@ use anyhow::{Context, ensure};
 use support::daemon::Daemon;
 use support::deployer::{Outcome, run};
 use support::machine::{Machine, free_port};
-use support::robot::PATIENCE;
+use support::patience::{Patient, connect, patience};
 use support::site::Site;
 use support::tls::Proxy;
 use support::world::{ADDER, TELLER, world};
@@ -41,7 +41,7 @@ export ROS_MASTER_URI=http://localhost:{port} CLOUDROID_LOCAL=none
 rosmaster --core -p {port} > /dev/null 2>&1 & master=$!
 until rosparam list > /dev/null 2>&1; do kill -0 $master; sleep 0.1; done
 rosrun teller_py teller.py > said 2>&1 &
-timeout 60 rostopic echo -n 1 -p /teller/told
+timeout "$PATIENCE" rostopic echo -n 1 -p /teller/told
 cat said"#
     );
     let outcome = machine.runs("bash", &script)?.succeeded()?;
@@ -104,7 +104,8 @@ const TOKENS: &str = "tokens = [\"open sesame\"]\n";
 fn curl(daemon: &Daemon, url: &str) -> anyhow::Result<Outcome> {
     let own = daemon.home.join("tls/own.pem");
     run(Command::new("curl")
-        .args(["--silent", "--show-error", "--max-time", "60"])
+        .args(["--silent", "--show-error", "--max-time"])
+        .arg(patience().as_secs().to_string())
         .args(["--write-out", "\n%{http_code}", "--cacert"])
         .arg(own)
         .args(["-H", "Authorization: Bearer open sesame", url]))
@@ -147,11 +148,8 @@ pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
     let words = format!("certificate {shown}");
     ensure!(status.stdout.contains(&words), "{}", status.said());
     // Who says nothing, or something else than both, is let go.
-    let connects = || -> anyhow::Result<TcpStream> {
-        let stream = TcpStream::connect(("127.0.0.1", port.parse()?))?;
-        stream.set_read_timeout(Some(PATIENCE))?;
-        Ok(stream)
-    };
+    let connects =
+        || -> anyhow::Result<Patient<TcpStream>> { connect(&format!("127.0.0.1:{port}")) };
     let (mut silent, mut garbled) = (connects()?, connects()?);
     garbled.write_all(&[22, 3, 1, 0, 5, 255, 255, 255, 255, 255])?;
     garbled.read_to_end(&mut Vec::new())?;
@@ -171,6 +169,7 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
     let url = format!("wss://localhost:{port}/{}?robot=secure", ADDER.name);
     let mut robot = Command::new(binaries::python());
     robot.arg("-c").arg(ROSLIBPY).arg(&url);
+    robot.arg(patience().as_secs().to_string());
     let outcome = run(&mut robot)?.succeeded()?;
     ensure!(outcome.stdout.contains("42"), "{}", outcome.said());
     let site = Site::new()?;
@@ -341,7 +340,7 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
                 "--show-error",
                 "--fail",
                 "--max-time",
-                "60",
+                &patience().as_secs().to_string(),
                 "--cacert",
             ])
             .arg(at(authority))
@@ -379,9 +378,10 @@ const ROSLIBPY: &str = r#"
 import sys
 import roslibpy
 ros = roslibpy.Ros(sys.argv[1])
-ros.run(timeout=60)
+patience = float(sys.argv[2])
+ros.run(timeout=patience)
 adder = roslibpy.Service(ros, "/add_two", "adder_py/AddTwo")
-print(adder.call(roslibpy.ServiceRequest({"a": 40, "b": 2}), timeout=60)["sum"])
+print(adder.call(roslibpy.ServiceRequest({"a": 40, "b": 2}), timeout=patience)["sum"])
 ros.terminate()
 "#;
 

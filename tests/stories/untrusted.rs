@@ -6,7 +6,8 @@ use std::net::TcpStream;
 use anyhow::{Context, ensure};
 use serde_json::json;
 use support::Verdict;
-use support::robot::{PATIENCE, Robot};
+use support::patience::{Deadline, connect};
+use support::robot::Robot;
 use support::world::{ADDER, GREETER, world};
 use tokio_tungstenite::tungstenite::Message;
 
@@ -32,12 +33,9 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
         dribbler.set_nonblocking(true)?;
         let begun = index % 2 == 0;
         let mut heard = Vec::new();
-        let deadline = std::time::Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         loop {
-            ensure!(
-                std::time::Instant::now() < deadline,
-                "connection {index} is still open"
-            );
+            deadline.check(|| format!("connection {index} is still open"))?;
             // One byte more keeps nobody in: the time is for the whole header.
             if begun {
                 let _ = dribbler.write(b"x");
@@ -60,8 +58,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
 
 pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
     let daemon = world().with(ADDER)?;
-    let mut connection = TcpStream::connect(&daemon.address)?;
-    connection.set_read_timeout(Some(PATIENCE))?;
+    let mut connection = connect(&daemon.address)?;
     connection.write_all(&[
         0x16, 3, 1, 2, 0, 1, 0, 1, 0xfc, 3, 3, b'\r', b'\n', b'\r', b'\n',
     ])?;
@@ -190,7 +187,7 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     })?;
     let mut ahead = 0;
     loop {
-        match slow.frame(PATIENCE)? {
+        match slow.frame()? {
             Message::Binary(bytes) if bytes.len() > SIZE => ahead += 1,
             Message::Text(text) if text.contains("urgent") => break,
             other => anyhow::bail!("{other:?}"),

@@ -1,13 +1,13 @@
 //! Viewers of others (Foxglove, Lichtblick) look into a servant by Foxglove's protocol.
 
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::binaries;
 use support::deployer::run;
+use support::patience::tell_patience;
 use support::robot::{Refusal, Robot};
 use tokio_tungstenite::tungstenite::{Bytes, Message};
 
@@ -36,7 +36,7 @@ pub fn foxglove(program: &str, url: &str, part: &str) -> Verdict {
         .arg(binaries::checkout().join("tests/robots").join(program))
         .args([url, part])
         .env("NODE_PATH", binaries::node_modules());
-    let said = run(&mut client)?.succeeded()?.stdout;
+    let said = run(tell_patience(&mut client))?.succeeded()?.stdout;
     ensure!(said.ends_with("done\n"), "{said}");
     Ok(())
 }
@@ -87,6 +87,23 @@ pub fn foxgloves_client_hears_and_an_operators_acts() -> Verdict {
     refused(attaches(&scene, &olga), 404, "servant")?;
     scene.daemon.ends()?;
     Ok(())
+}
+
+/// Of a picture that has begun to come, and is not read.
+const SOME: usize = 32 << 10;
+/// More pictures than wait for a viewer: two, and what its socket takes.
+const MANY: usize = 20;
+
+fn asks_for_pictures(viewer: &mut Robot) -> Verdict {
+    let is_picture = |channel: &Value| channel["topic"] == "/sights/image/rgb8";
+    let advertised = viewer.hears("the picture", |said| {
+        let channels = said["channels"].as_array();
+        channels.is_some_and(|channels| channels.iter().any(is_picture))
+    })?;
+    let channels = advertised["channels"].as_array().context("channels")?;
+    let picture = channels.iter().find(|channel| is_picture(channel));
+    let picture = &picture.context("the channel")?["id"];
+    viewer.says(json!({"op": "subscribe", "subscriptions": [{"id": 0, "channelId": picture}]}))
 }
 
 pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
@@ -156,18 +173,18 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
 
     // Thirty pictures a second that nobody takes: the robot loses nothing.
     let mut slow = Robot::on_a_short_line(&address(&scene, &eve), &[PROTOCOL])?;
-    let is_picture = |channel: &Value| channel["topic"] == "/sights/image/rgb8";
-    let advertised = slow.hears("the picture", |said| {
-        let channels = said["channels"].as_array();
-        channels.is_some_and(|channels| channels.iter().any(is_picture))
+    asks_for_pictures(&mut slow)?;
+    support::until("a picture that it does not take", || {
+        let bytes = slow.counts_waiting()?;
+        Ok((bytes >= SOME)
+            .then_some(())
+            .ok_or(format!("{bytes} bytes")))
     })?;
-    let channels = advertised["channels"].as_array().context("channels")?;
-    let picture = channels.iter().find(|channel| is_picture(channel));
-    let picture = &picture.context("the channel")?["id"];
-    slow.says(json!({"op": "subscribe", "subscriptions": [{"id": 0, "channelId": picture}]}))?;
-    // As long as it takes to fill what waits for it, and more.
-    let begun = Instant::now();
-    while begun.elapsed() < Duration::from_secs(4) {
+    // What waits for it is full when another has taken so many more.
+    let mut quick = attaches(&scene, &eve)?;
+    asks_for_pictures(&mut quick)?;
+    for _ in 0..MANY {
+        hears_a_picture(&mut quick)?;
         let answer = scene.rover.calls("/sights/ping", json!({}))?;
         ensure!(answer["values"]["message"] == "pong", "{answer}");
     }

@@ -1,6 +1,7 @@
 //! An authority that is asked by ACME (RFC 8555): Pebble, which Let's Encrypt tests clients with, and a DNS in which every name leads to
 //! this machine.
 
+use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};
 
 use anyhow::Context;
@@ -111,17 +112,18 @@ impl Directory {
 }
 
 impl Authority {
-    /// It listens as soon as it is reached.
+    /// Waits until it listens.
     fn is_reached(&mut self) -> anyhow::Result<()> {
-        while std::net::TcpStream::connect(("127.0.0.1", self.directory)).is_err() {
+        crate::until("Pebble that listens", || {
+            let reached = TcpStream::connect(("127.0.0.1", self.directory));
             for child in &mut self.running {
                 if let Some(status) = child.try_wait()? {
                     let log = std::fs::read_to_string(self.place.join("log"))?;
                     anyhow::bail!("Pebble ended with {status}:\n{log}");
                 }
             }
-        }
-        Ok(())
+            Ok(reached.map(drop).map_err(|error| error.to_string()))
+        })
     }
 
     /// The certificate by which those are known that it has signed.

@@ -14,10 +14,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use nix::sched::CloneFlags;
 
+use crate::patience::scale;
 use crate::shaper::Shaper;
 
 /// Names and addresses of this process's cables.
@@ -236,7 +238,7 @@ impl Drop for Cable {
         self.over.store(true, Ordering::Relaxed);
         // Wakes whoever accepts.
         let _ = self.restore();
-        let _ = TcpStream::connect_timeout(&self.server, std::time::Duration::from_secs(5));
+        let _ = TcpStream::connect_timeout(&self.server, scale(Duration::from_secs(5)));
         let _ = ip(&["link", "del", &self.ends[0]]);
         let _ = ip(&["netns", "del", &self.name]);
     }

@@ -2,12 +2,10 @@
 
 use std::fs::File;
 use std::io::{Read, Write};
-use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use nix::sys::signal::{Signal, kill};
@@ -16,7 +14,8 @@ use serde_json::Value;
 
 use crate::binaries;
 use crate::deployer::Deployer;
-use crate::robot::{PATIENCE, Robot};
+use crate::patience::{self, Patient};
+use crate::robot::Robot;
 
 /// A running `cloudroidd`.
 pub struct Daemon {
@@ -152,7 +151,7 @@ impl Setup {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()?;
-        let output = wait_with_output_within(output, PATIENCE)?;
+        let output = wait_with_output(output)?;
         let said = format!(
             "{}{}",
             String::from_utf8_lossy(&output.1),
@@ -167,10 +166,8 @@ impl Setup {
     }
 }
 
-fn wait_with_output_within(
-    mut child: Child,
-    limit: Duration,
-) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
+/// Waits for its end, as long as a story waits.
+fn wait_with_output(mut child: Child) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
     let pid = Pid::from_raw(child.id() as i32);
     let (mut out, mut err) = (
         child.stdout.take().expect("piped"),
@@ -178,7 +175,7 @@ fn wait_with_output_within(
     );
     let (done, ended) = std::sync::mpsc::channel::<()>();
     let watchdog = std::thread::spawn(move || {
-        if ended.recv_timeout(limit).is_err() {
+        if patience::receive(&ended).is_err() {
             let _ = kill(pid, Signal::SIGKILL);
         }
     });
@@ -259,8 +256,7 @@ impl Daemon {
         path: &str,
         headers: &[(&str, &str)],
     ) -> anyhow::Result<(u16, String)> {
-        let stream = TcpStream::connect(&self.address)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
+        let stream = patience::connect(&self.address)?;
         self.exchange(stream, method, path, headers)
     }
 
@@ -272,8 +268,7 @@ impl Daemon {
         headers: &[(&str, &str)],
         body: &str,
     ) -> anyhow::Result<(u16, String, String)> {
-        let mut stream = TcpStream::connect(&self.address)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
+        let mut stream = patience::connect(&self.address)?;
         let given = |usual: &str| {
             headers
                 .iter()
@@ -300,8 +295,7 @@ impl Daemon {
     /// What the API answers to `GET PATH` over the daemon's own socket, where the caller is its operator.
     pub fn api(&self, path: &str) -> anyhow::Result<Value> {
         let stream = UnixStream::connect(self.home.join("run/daemon.sock"))?;
-        stream.set_read_timeout(Some(PATIENCE))?;
-        let (status, body) = self.exchange(stream, "GET", path, &[])?;
+        let (status, body) = self.exchange(Patient::new(stream)?, "GET", path, &[])?;
         ensure!(status == 200, "GET {path}: {status} {body}");
         Ok(serde_json::from_str(&body)?)
     }

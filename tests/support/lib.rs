@@ -18,6 +18,7 @@ pub mod grants;
 pub mod layout;
 pub mod leftovers;
 pub mod machine;
+pub mod patience;
 pub mod people;
 pub mod procfs;
 pub mod provider;
@@ -32,9 +33,11 @@ pub mod twins;
 pub mod wire;
 pub mod world;
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::bail;
+
+use crate::patience::{Deadline, describe_slowness};
 
 /// Between two looks at what no event tells of.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -43,7 +46,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 pub type Verdict = anyhow::Result<()>;
 
 /// Looks again and again, with a pause, until there is a value. What is found instead becomes the story's failure after
-/// [`robot::PATIENCE`].
+/// [`patience::patience`].
 ///
 /// # Errors
 /// When looking fails, and when time is up.
@@ -51,12 +54,15 @@ pub fn until<T>(
     what: &str,
     mut look: impl FnMut() -> anyhow::Result<Result<T, String>>,
 ) -> anyhow::Result<T> {
-    let deadline = Instant::now() + robot::PATIENCE;
+    let deadline = Deadline::begin();
     loop {
         match look()? {
             Ok(found) => return Ok(found),
-            Err(instead) if Instant::now() > deadline => {
-                bail!("{what} did not come about; instead: {instead}")
+            Err(instead) if deadline.is_over() => {
+                bail!(
+                    "{what} did not come about; instead: {instead}\n{}",
+                    describe_slowness()
+                )
             }
             Err(_) => std::thread::sleep(LOOK_EVERY),
         }

@@ -11,6 +11,7 @@ use nix::fcntl::{Flock, FlockArg};
 use crate::binaries;
 use crate::daemon::Daemon;
 use crate::deployer::{Outcome, path_str, run};
+use crate::patience::patience;
 use crate::world::{Directory, world};
 
 /// What robots have: the tools that find and start nodes, three shells, a package with its original nodes, and what
@@ -113,7 +114,8 @@ impl Machine {
         Ok(())
     }
 
-    /// Runs a script in a shell (`sh`, `bash` or `zsh`), as root at home.
+    /// Runs a script in a shell (`sh`, `bash` or `zsh`), as root at home. `$PATIENCE` says how many seconds it is to wait for what must
+    /// come.
     pub fn runs(&self, shell: &str, script: &str) -> anyhow::Result<Outcome> {
         let own = self.own.path();
         run(Command::new("unshare")
@@ -121,7 +123,8 @@ impl Machine {
             .arg("inside")
             .args([shell, script])
             .env("BASE", &self.base)
-            .env("OWN", own))
+            .env("OWN", own)
+            .env("PATIENCE", patience().as_secs().to_string()))
     }
 }
 
@@ -139,7 +142,7 @@ printf '127.0.0.1 localhost %s\n' "$(hostname)" > "$OWN/root/etc/hosts"
 cd "$OWN/root"
 exec unshare --pid --fork --kill-child sh -euc '
   mount -t proc proc proc
-  exec chroot . /usr/bin/env -i PATH=/usr/bin:/bin HOME=/root TERM=dumb SHELL="/bin/$1" \
+  exec chroot . /usr/bin/env -i PATH=/usr/bin:/bin HOME=/root TERM=dumb SHELL="/bin/$1" PATIENCE="$PATIENCE" \
     sh -c "cd; exec \"\$@\"" sh "$1" -c "$2"' inside "$@"
 "#;
 

@@ -12,6 +12,7 @@ use crate::binaries;
 use crate::daemon::{Daemon, Setup};
 use crate::deployer::{path_str, run};
 use crate::machine::free_port;
+use crate::patience::patience;
 use crate::world::{Directory, world};
 
 /// What it shares with the daemon.
@@ -247,7 +248,8 @@ impl Browser {
         let authority = self.authority.as_deref().map(path_str);
         let trusts = authority.map(|path| ["--cacert", path]);
         let outcome = run(Command::new("curl")
-            .args(["--silent", "--show-error", "--max-time", "60"])
+            .args(["--silent", "--show-error", "--max-time"])
+            .arg(patience().as_secs().to_string())
             .args(["--cookie", jar, "--cookie-jar", jar])
             .args(["--write-out", "\n%{http_code} %{redirect_url}"])
             .args(trusts.iter().flatten())

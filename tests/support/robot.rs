@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::net::TcpStream;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
@@ -10,12 +10,11 @@ use tokio_tungstenite::tungstenite::http::Uri;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::{self, ClientRequestBuilder, Message, WebSocket};
 
-/// How long a story waits for what must come. Long: these machines are slow and shared.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+use crate::patience::{Deadline, Patient, describe_slowness, is_slow};
 
 /// One connection.
 pub struct Robot {
-    socket: WebSocket<TcpStream>,
+    socket: WebSocket<Patient<TcpStream>>,
     backlog: VecDeque<Value>,
     calls: u64,
 }
@@ -42,7 +41,7 @@ impl Robot {
         let stream = TcpStream::connect(address)?;
         nix::sys::socket::setsockopt(&stream, nix::sys::socket::sockopt::RcvBuf, &(64 * 1024))?;
         let request = offering(url.parse()?, protocols);
-        let (socket, _) = tungstenite::client(request, stream)
+        let (socket, _) = tungstenite::client(request, Patient::new(stream)?)
             .map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
         Ok(Robot {
             socket,
@@ -81,6 +80,7 @@ impl Robot {
         let stream =
             TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
         let _ = stream.set_nodelay(true);
+        let stream = Patient::new(stream).map_err(|error| Refusal::other(&error.to_string()))?;
         let uri = url
             .parse()
             .map_err(|error| Refusal::other(&format!("{error}")))?;
@@ -121,11 +121,25 @@ impl Robot {
     }
 
     /// The next frame, whatever it is.
-    pub fn frame(&mut self, within: Duration) -> anyhow::Result<Message> {
-        self.socket
-            .get_ref()
-            .set_read_timeout(Some(within.max(Duration::from_millis(1))))?;
+    pub fn frame(&mut self) -> anyhow::Result<Message> {
         Ok(self.socket.read()?)
+    }
+
+    /// The same, if it comes in this time; for measurements.
+    pub fn frame_within(&mut self, time: Duration) -> anyhow::Result<Message> {
+        self.socket.get_mut().limit(Some(time))?;
+        let frame = self.socket.read();
+        self.socket.get_mut().limit(None)?;
+        Ok(frame?)
+    }
+
+    /// Counts bytes that wait to be read, up to some thousand.
+    pub fn counts_waiting(&self) -> anyhow::Result<usize> {
+        let mut bytes = vec![0; 64 << 10];
+        match self.socket.get_ref().get().peek(&mut bytes) {
+            Err(error) if is_slow(&error) => Ok(0),
+            peeked => Ok(peeked?),
+        }
     }
 
     /// The first message that `wanted` accepts; others are kept for later.
@@ -133,17 +147,17 @@ impl Robot {
         if let Some(index) = self.backlog.iter().position(&wanted) {
             return Ok(self.backlog.remove(index).expect("just found"));
         }
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Deadline::begin();
         loop {
-            let remaining = deadline.saturating_duration_since(Instant::now());
-            if remaining.is_zero() {
-                bail!(
-                    "{what} did not come within {PATIENCE:?}; heard instead: {:?}",
-                    self.backlog
-                );
-            }
+            deadline.check(|| {
+                let heard = &self.backlog;
+                format!(
+                    "{what} did not come; {}; heard instead: {heard:?}",
+                    describe_slowness()
+                )
+            })?;
             let frame = self
-                .frame(remaining)
+                .frame()
                 .with_context(|| format!("waiting for {what}; heard so far: {:?}", self.backlog))?;
             let value = match frame {
                 Message::Text(text) => serde_json::from_str(text.as_str())?,
@@ -198,17 +212,29 @@ impl Robot {
 
     /// Waits until a node listens to `topic`, by asking rosapi again and again.
     pub fn awaits_subscriber(&mut self, topic: &str) -> anyhow::Result<()> {
-        let deadline = Instant::now() + PATIENCE;
-        while Instant::now() < deadline {
+        crate::until(&format!("a subscriber of {topic}"), || {
             let answer = self.calls("/rosapi/subscribers", json!({"topic": topic}))?;
-            if answer["values"]["subscribers"]
-                .as_array()
-                .is_some_and(|nodes| !nodes.is_empty())
-            {
-                return Ok(());
+            let nodes = answer["values"]["subscribers"].as_array();
+            let is_heard = nodes.is_some_and(|nodes| !nodes.is_empty());
+            Ok(is_heard.then_some(()).ok_or_else(|| answer.to_string()))
+        })
+    }
+
+    /// Says something again and again until it hears what comes of it: what is said, or answered, before both sides are
+    /// connected is lost, as in every ROS. More of what was asked for more than once may come later.
+    pub fn says_until(
+        &mut self,
+        message: &Value,
+        what: &str,
+        wanted: impl Fn(&Value) -> bool,
+    ) -> anyhow::Result<Value> {
+        crate::until(what, || {
+            self.says(message.clone())?;
+            if self.has_not_heard(&wanted)? {
+                return Ok(Err("it hears nothing yet".to_owned()));
             }
-        }
-        bail!("nobody subscribed to {topic} within {PATIENCE:?}")
+            self.hears(what, &wanted).map(Ok)
+        })
     }
 
     /// Subscribes and says so by nothing, as the protocol has it.
@@ -219,7 +245,7 @@ impl Robot {
     /// Waits for the other side to close, and gives code and reason.
     pub fn hears_close(&mut self) -> anyhow::Result<CloseFrame> {
         loop {
-            match self.frame(PATIENCE) {
+            match self.frame() {
                 Ok(Message::Close(Some(frame))) => return Ok(frame),
                 Ok(Message::Close(None)) => bail!("closed without a reason"),
                 Ok(_) => {}
@@ -233,7 +259,7 @@ impl Robot {
     /// Says goodbye and waits for the answer.
     pub fn leaves(mut self) -> anyhow::Result<()> {
         self.socket.close(None)?;
-        while self.frame(PATIENCE).is_ok() {}
+        while self.frame().is_ok() {}
         Ok(())
     }
 }

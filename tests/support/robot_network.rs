@@ -16,7 +16,7 @@ use serde_json::Value;
 
 use crate::binaries;
 use crate::cable::{Cable, ip, within};
-use crate::robot::PATIENCE;
+use crate::patience;
 use crate::ros_system::Domain;
 use crate::site::Site;
 
@@ -154,7 +154,9 @@ pub struct Application {
 impl Application {
     /// Starts it; returns when it says that it is ready.
     fn starts(mut command: Command, namespace: &Path) -> anyhow::Result<Self> {
-        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        patience::tell_patience(&mut command)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped());
         let mut child = within(namespace, || command.spawn())?.context("starting a program")?;
         let (said, lines) = channel();
         let output = child.stdout.take().context("its output")?;
@@ -173,7 +175,7 @@ impl Application {
     }
 
     fn hears(&self, what: &str) -> anyhow::Result<Value> {
-        let line = self.lines.recv_timeout(PATIENCE);
+        let line = patience::receive(&self.lines);
         let line = line.with_context(|| format!("an application should say {what}"))?;
         let words: Value = serde_json::from_str(&line).with_context(|| line.clone())?;
         ensure!(words[0] == what, "{words} instead of {what}");

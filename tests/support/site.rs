@@ -24,9 +24,12 @@ use crate::binaries;
 use crate::cable::within;
 use crate::daemon::Daemon;
 use crate::deployer::path_str;
-use crate::robot::PATIENCE;
+use crate::patience::{self, Deadline, patience};
 use crate::ros_system::{Domain, Node, RosSystem};
 use crate::world::Directory;
+
+/// A message that will come is nearly always there by then.
+const MOMENT: Duration = Duration::from_millis(200);
 
 /// A robot.
 pub struct Site {
@@ -113,17 +116,14 @@ impl Site {
     ) -> anyhow::Result<Graph> {
         let mut graphs = node.bus().graph();
         let found = self.runtime.block_on(async {
-            let found = tokio::time::timeout(PATIENCE, graphs.wait_for(|graph| wanted(graph)));
+            let found = patience::wait_for(graphs.wait_for(|graph| wanted(graph)));
             found
                 .await
                 .map(|found| found.map(|graph| (**graph).clone()))
         });
         match found {
             Ok(graph) => Ok(graph?),
-            Err(_) => bail!(
-                "{what} did not come about: {:#?}",
-                node.bus().graph().borrow()
-            ),
+            Err(error) => bail!("{what}: {error}: {:#?}", node.bus().graph().borrow()),
         }
     }
 
@@ -164,7 +164,7 @@ impl Site {
     pub fn next(&self, subscription: &mut Subscription) -> anyhow::Result<Message> {
         let next = self
             .runtime
-            .block_on(async { tokio::time::timeout(PATIENCE, subscription.messages.recv()).await });
+            .block_on(patience::wait_for(subscription.messages.recv()));
         next.context("a message should come")?
             .context("the topic ended")
     }
@@ -182,11 +182,32 @@ impl Site {
         }
     }
 
+    /// Asks again and again until a message comes that is wanted: as in every ROS, what is said before all are connected is lost.
+    /// Of those that were asked for more than once some may come later.
+    pub fn asks_until(
+        &self,
+        subscription: &mut Subscription,
+        mut ask: impl FnMut() -> anyhow::Result<()>,
+        mut wanted: impl FnMut(&Message) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<Message> {
+        let deadline = Deadline::begin();
+        loop {
+            ask()?;
+            while let Some(message) = self.next_within(subscription, patience::scale(MOMENT))? {
+                if wanted(&message)? {
+                    return Ok(message);
+                }
+                deadline.check(|| format!("{message:?} came last, and is not what should"))?;
+            }
+            deadline.check(|| "nothing came that was asked for".to_owned())?;
+        }
+    }
+
     /// Waits until so many subscribers are connected.
     pub fn connected(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
         let mut now = publisher.matched();
         let reached = self.runtime.block_on(async {
-            tokio::time::timeout(PATIENCE, now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected() == count))
                 .await
                 .is_ok()
         });
@@ -202,7 +223,7 @@ impl Site {
     pub fn fed(&self, subscription: &Subscription, count: usize) -> anyhow::Result<()> {
         let mut now = subscription.matched.clone();
         let reached = self.runtime.block_on(async {
-            tokio::time::timeout(PATIENCE, now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected() == count))
                 .await
                 .is_ok()
         });
@@ -222,7 +243,7 @@ impl Site {
         request: &[u8],
     ) -> anyhow::Result<Bytes> {
         let request = Bytes::copy_from_slice(request);
-        let called = node.bus().call(service, request, PATIENCE);
+        let called = node.bus().call(service, request, patience());
         Ok(self.runtime.block_on(called)?)
     }
 

@@ -1,5 +1,6 @@
 //! A proxy that speaks TLS in front of a portal, with an authority of its own, as a robot's owner might have.
 
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
@@ -64,10 +65,12 @@ impl Proxy {
             serving,
         };
         // It listens as soon as it is reached.
-        while std::net::TcpStream::connect(("127.0.0.1", port)).is_err() {
+        crate::until("a proxy that listens", || {
+            let reached = TcpStream::connect(("127.0.0.1", port));
             let ended = proxy.serving.try_wait()?;
             ensure!(ended.is_none(), "socat ended: {ended:?}");
-        }
+            Ok(reached.map(drop).map_err(|error| error.to_string()))
+        })?;
         Ok(proxy)
     }
 

@@ -1,26 +1,23 @@
 //! Bytes sent to a daemon as they are: requests that no client library would write.
 
 use std::io::{Read, Write};
-use std::net::TcpStream;
 
 use anyhow::ensure;
 
-use crate::robot::PATIENCE;
+use crate::patience::{connect, is_slow};
 
 /// All that comes back for `sent` until the other side ends the connection. What is sent must ask for that.
 ///
 /// # Errors
-/// Where nobody listens, and where the connection does not end within [`PATIENCE`].
+/// Where nobody listens, and where the connection does not end within the time that a story waits.
 pub fn answers(address: &str, sent: &[u8]) -> anyhow::Result<String> {
-    let stream = TcpStream::connect(address)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    exchange(stream, sent)
+    exchange(connect(address)?, sent)
 }
 
 /// The same over a connection that is there.
 ///
 /// # Errors
-/// Where the connection does not end within its read timeout.
+/// Where the connection does not end in time.
 pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<String> {
     // Who is refused at the first line may be let go before the last one is written.
     let _ = stream.write_all(sent);
@@ -31,9 +28,8 @@ pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<St
             Ok(0) => break,
             Ok(length) => heard.extend_from_slice(&buffer[..length]),
             Err(error) => {
-                let waited = [std::io::ErrorKind::WouldBlock, std::io::ErrorKind::TimedOut];
                 ensure!(
-                    !waited.contains(&error.kind()),
+                    !is_slow(&error),
                     "the connection is still open after {:?}",
                     String::from_utf8_lossy(&heard)
                 );

@@ -106,7 +106,7 @@ fn robot(daemon: &Daemon, number: usize) -> Result<Went> {
     };
     loop {
         let patience = if went.answers == 0 { PATIENCE } else { AGAIN };
-        let Ok(frame) = robot.frame(patience) else {
+        let Ok(frame) = robot.frame_within(patience) else {
             break;
         };
         let Message::Text(text) = frame else {

@@ -39,7 +39,7 @@ pub(crate) fn messages(daemon: &Daemon) -> Result<String> {
         let frame = Frame::message(vec![7; MESSAGE], OpCode::Data(Data::Binary), false);
         robot.sends(Message::Frame(frame))?;
         // Refused, or not.
-        let closed = robot.frame(Duration::from_secs(2));
+        let closed = robot.frame_within(Duration::from_secs(2));
         Ok((closed, robot))
     });
     let open = held.iter().filter(|(heard, _)| heard.is_err()).count();

@@ -12,6 +12,7 @@ import warnings
 warnings.simplefilter("ignore")
 asked = json.loads(sys.argv[1])
 host, port = asked["host"], asked["port"]
+PATIENCE = float(os.environ["STORY_PATIENCE"])
 address = f"{host}:{port}"
 
 
@@ -28,8 +29,8 @@ def context(change=lambda context: None):
 
 
 def plain():
-    connection = socket.create_connection((host, port), 60)
-    connection.settimeout(60)
+    connection = socket.create_connection((host, port), PATIENCE)
+    connection.settimeout(PATIENCE)
     return connection
 
 
@@ -141,7 +142,7 @@ for name, sent in [
         tell(f"bytes {name}", status(heard(connection)))
 renegotiated = subprocess.run(
     ["openssl", "s_client", "-connect", address, "-tls1_2", "-legacy_renegotiation"], input=b"R\n" + GET,
-    stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=60, check=False).stdout
+    stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=PATIENCE, check=False).stdout
 tell("renegotiation", "200" if b"HTTP/1.1 200" in renegotiated else "ended")
 
 # One who begins many handshakes, and goes no further, keeps nobody else out: this is asked by the server's own machine.
@@ -154,13 +155,13 @@ for number in range(300):
     except OSError:
         pass
 others = subprocess.run(
-    ["nsenter", "--net", "--target", str(os.getppid()), "curl", "--silent", "--insecure", "--max-time", "60", "--output", "/dev/null",
-     "--write-out", "%{http_code}", f"https://{address}/healthz"], stdout=subprocess.PIPE, timeout=90, check=False).stdout.decode()
+    ["nsenter", "--net", "--target", str(os.getppid()), "curl", "--silent", "--insecure", "--max-time", str(int(PATIENCE)), "--output", "/dev/null",
+     "--write-out", "%{http_code}", f"https://{address}/healthz"], stdout=subprocess.PIPE, timeout=2 * PATIENCE, check=False).stdout.decode()
 tell("health for others beside half-open handshakes", others)
 for connection in silent:
     connection.close()
 # Its own next ones are let in when the server has seen that these are over.
-until = time.monotonic() + 60
+until = time.monotonic() + PATIENCE
 while through(request("GET", "/healthz")) != "200" and time.monotonic() < until:
     pass
 

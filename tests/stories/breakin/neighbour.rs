@@ -8,6 +8,7 @@ use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::{Outcome, path_str, run};
+use support::patience::tell_patience;
 use support::world::world;
 use support::{Verdict, binaries};
 
@@ -57,7 +58,7 @@ impl Network {
 
     /// Runs a program there.
     fn runs(&self, program: &Path, arguments: &[&str]) -> anyhow::Result<Outcome> {
-        run(Command::new("ip")
+        run(tell_patience(&mut Command::new("ip"))
             .args(["netns", "exec", &self.name])
             .arg(program)
             .args(arguments))

@@ -14,7 +14,7 @@ use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::PATIENCE;
+use support::patience::{self, Patient};
 use support::world::world;
 
 use super::scene::state;
@@ -70,19 +70,18 @@ impl Site {
     }
 
     /// Gives a request to the portal as it is.
-    fn pass_on(&self, mut stream: TcpStream, head: &str, body: &[u8]) -> anyhow::Result<()> {
+    fn pass_on(&self, stream: TcpStream, head: &str, body: &[u8]) -> anyhow::Result<()> {
         let mut portal = TcpStream::connect(&self.portal)?;
-        portal.set_read_timeout(Some(PATIENCE))?;
         // One request for each connection: the next one may be the site's.
         let head = head.replace("Connection: keep-alive", "Connection: close");
         portal.write_all(head.as_bytes())?;
         portal.write_all(body)?;
-        let (mut from, mut to) = (portal.try_clone()?, stream.try_clone()?);
+        let (mut from, mut to) = (Patient::new(portal.try_clone()?)?, stream.try_clone()?);
         let back = std::thread::spawn(move || {
             let _ = std::io::copy(&mut from, &mut to);
             let _ = to.shutdown(Shutdown::Both);
         });
-        let _ = std::io::copy(&mut stream, &mut portal);
+        let _ = std::io::copy(&mut Patient::new(stream)?, &mut portal);
         let _ = portal.shutdown(Shutdown::Both);
         let _ = back.join();
         Ok(())
@@ -119,7 +118,7 @@ fn tries(daemon: &Daemon, cookie: &str) -> anyhow::Result<Vec<Value>> {
     let browser = Browser::opens(&format!("{}/page?0", sites[0]), profile.path(), &[leads])?;
     let mut all = Vec::new();
     for site in &sites {
-        let told = said.recv_timeout(PATIENCE * 2);
+        let told = patience::receive(&said);
         let told = told.with_context(|| format!("{site} said nothing"))?;
         let told = told.as_array().with_context(|| format!("{site}: {told}"))?;
         all.extend(told.iter().cloned());

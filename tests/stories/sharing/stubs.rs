@@ -18,14 +18,14 @@ use ros::schema::{MessageType, Registry};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
-use support::robot::PATIENCE;
+use support::patience::{patience, scale, tell_patience, wait_for};
 use support::site::{Running, Site, registered};
 use support::{Verdict, binaries};
 use tokio::sync::mpsc;
 
 use super::{OF_TWO, Sharer, fails, ready, sends_goal};
 
-/// A call of ROS 2 that fails is not answered; so long one is waited for that may be such.
+/// A call of ROS 2 that fails is not answered; so long one is waited for that may be such, where nothing else runs.
 const UNANSWERED: Duration = Duration::from_secs(10);
 
 fn serialized(of: &MessageType, values: &Value) -> anyhow::Result<Bytes> {
@@ -121,11 +121,11 @@ impl Linked {
     /// Who was answered, and by which servant; nobody where it was not.
     fn works(&self, who: &str, seconds: f64) -> anyhow::Result<Option<(String, String)>> {
         let request = self.request(who, seconds)?;
-        let patience = match self.sharer.ros {
-            RosVersion::One => PATIENCE,
-            RosVersion::Two => UNANSWERED,
+        let time = match self.sharer.ros {
+            RosVersion::One => patience(),
+            RosVersion::Two => scale(UNANSWERED),
         };
-        let called = self.app.call(self.work, request, patience);
+        let called = self.app.call(self.work, request, time);
         let answer = match (self.sharer.ros, self.site.runtime.block_on(called)) {
             (_, Ok(answer)) => answer,
             (RosVersion::Two, Err(BusError::Timeout { .. })) => return Ok(None),
@@ -158,14 +158,14 @@ impl Linked {
         let (told, events) = mpsc::unbounded_channel();
         let _runtime = self.site.runtime.enter();
         let client = self.app.action_client(self.count, &of)?;
-        self.site.runtime.block_on(client.ready(PATIENCE))?;
+        self.site.runtime.block_on(client.ready(patience()))?;
         client.send(id, goal, Arc::new(Ear(told)));
         Ok(Counting { client, events })
     }
 
     /// The end of a goal, and its result.
     fn end(&self, counting: &mut Counting) -> anyhow::Result<(Outcome, Value)> {
-        let ended = async { tokio::time::timeout(PATIENCE, counting.events.recv()).await };
+        let ended = wait_for(counting.events.recv());
         let ended = self.site.runtime.block_on(ended).context("a result")?;
         let end = ended.context("an end")?.map_err(anyhow::Error::msg)?;
         let of = self.registry.action(self.sharer.count)?;
@@ -283,7 +283,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
     let request = plain.request("plain", 3600.0)?;
     let long = {
         let app = Arc::clone(&plain.app);
-        let call = async move { app.call("/work", request, PATIENCE).await };
+        let call = async move { app.call("/work", request, patience()).await };
         plain.site.runtime.spawn(call)
     };
     let victim = sharer.busy(&daemon)?;
@@ -365,7 +365,7 @@ fn application(linked: &Linked, daemon: &Daemon, what: &str) -> anyhow::Result<V
     let mut command = Command::new(prefix.join("lib/application/application"));
     command.args(["-c", &text, what]);
     site.system.is_of(&mut command);
-    let told = run(&mut command)?.succeeded();
+    let told = run(tell_patience(&mut command))?.succeeded();
     let told = told.with_context(|| format!("the stub said:\n{}", linked.stub.said()))?;
     serde_json::from_str(&told.stdout).context(told.stdout)
 }

@@ -3,11 +3,10 @@
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::Instant;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use serde_json::json;
-use support::robot::PATIENCE;
+use support::patience::Deadline;
 use support::{Verdict, binaries};
 
 use crate::machine::{HOME, SERVANTS, daemon, types};
@@ -63,11 +62,9 @@ fn the_store_verifies() -> Verdict {
 
 /// Waits for what is in the middle.
 fn once(what: &str, there: impl Fn() -> bool) -> Verdict {
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     while !there() {
-        if Instant::now() > deadline {
-            bail!("{what} was not seen");
-        }
+        deadline.check(|| format!("{what} was not seen"))?;
         std::thread::yield_now();
     }
     Ok(())

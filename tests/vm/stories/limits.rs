@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use support::Verdict;
 use support::burglar::tries;
 use support::daemon::Daemon;
-use support::robot::PATIENCE;
+use support::patience::Deadline;
 
 use crate::machine::{SERVANTS, control, daemon};
 
@@ -220,8 +220,8 @@ pub fn a_fork_bomb_ends_when_its_servant_does() -> Verdict {
     let id = id(&daemon, "small", "bomber")?;
     set(&daemon, &id, &["--pids", "100"])?;
     tries(&mut robot, "bomb", "")?;
-    let deadline = Instant::now() + PATIENCE;
-    while control(&id, "pids.current")?.parse::<u64>()? < 95 && Instant::now() < deadline {
+    let deadline = Deadline::begin();
+    while control(&id, "pids.current")?.parse::<u64>()? < 95 && !deadline.is_over() {
         std::thread::yield_now();
     }
     ensure!(

@@ -1,13 +1,13 @@
 //! The daemon ends and begins again; robots notice no more than a lost connection.
 
 use std::path::Path;
-use std::time::Instant;
 
 use anyhow::ensure;
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
-use support::robot::{PATIENCE, Robot};
+use support::patience::Deadline;
+use support::robot::Robot;
 
 use crate::machine::{HOME, daemon, main_pid, types};
 
@@ -20,9 +20,9 @@ fn count(robot: &mut Robot) -> anyhow::Result<Option<u64>> {
 fn greets(robot: &mut Robot) -> Verdict {
     let before = count(robot)?;
     robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Deadline::begin();
     while count(robot)? == before {
-        ensure!(Instant::now() < deadline, "the node hears nothing");
+        deadline.check(|| "the node hears nothing".to_owned())?;
         robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
     }
     Ok(())

@@ -9,7 +9,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-LONGEST = 30.0
+# Seconds that only a story which fails waits.
+LONGEST = 600.0
 
 
 class Courier(Node):

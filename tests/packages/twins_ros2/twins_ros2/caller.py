@@ -9,15 +9,15 @@ from std_srvs.srv import Trigger
 
 from twins_ros2.spun import spin
 
-# In seconds: for who serves what may be there, and what comes later.
+# In seconds: for who serves what may be there, and what comes later; only a story that fails waits so long.
 MOMENT = 0.5
-LONG = 120.0
+LONG = 600.0
 
 
 class Caller(Node):
     def __init__(self):
         super().__init__("crossing")
-        self.declare_parameter("patience", 60.0)
+        self.declare_parameter("patience", LONG)
         # Whoever waits keeps no other from being answered.
         group = ReentrantCallbackGroup()
         self.secret = self.create_client(Trigger, "/robot/secret", callback_group=group)
