@@ -4,7 +4,7 @@ use std::io::Write;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde_json::json;
-use support::binaries;
+use support::{binaries, patience};
 
 use super::{MOST_FLAKY, Outcome, Story, evidence_of};
 
@@ -79,7 +79,11 @@ impl Report {
             );
         }
         let all: Duration = self.told.iter().map(|outcome| outcome.took).sum();
-        println!("== {:.0} s of stories in all", all.as_secs_f64());
+        println!(
+            "== {:.0} s of stories in all; the machine was {:.1} times as slow as it can be, at most",
+            all.as_secs_f64(),
+            patience::busiest()
+        );
         for (name, reason) in &self.flaky {
             println!("FLAKY {name}: {}", shorten(reason));
             println!("      kept below {}", evidence_of(name, 1).display());

@@ -59,6 +59,7 @@ pub fn until<T>(
         match look()? {
             Ok(found) => return Ok(found),
             Err(instead) if deadline.is_over() => {
+                evidence::note_machine();
                 bail!(
                     "{what} did not come about; instead: {instead}\n{}",
                     describe_slowness()

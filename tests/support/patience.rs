@@ -21,7 +21,9 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow, bail, ensure};
+use anyhow::{Context, anyhow, bail};
+
+use crate::evidence;
 
 /// The working time that a story waits for what must come. Long: only a story that fails waits so long.
 const LONG: Duration = Duration::from_secs(120);
@@ -181,7 +183,10 @@ impl Deadline {
     /// # Errors
     /// Then.
     pub fn check(&self, instead: impl FnOnce() -> String) -> anyhow::Result<()> {
-        ensure!(!self.is_over(), "{}", instead());
+        if self.is_over() {
+            evidence::note_machine();
+            bail!("{}", instead());
+        }
         Ok(())
     }
 
