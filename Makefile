@@ -158,8 +158,7 @@ unit: build-dev ## the crates' own tests; SEED=n for other random cases than the
 
 .PHONY: robots
 robots:
-	@cargo build -q --locked --manifest-path tests/robots/roslibrust/Cargo.toml --target-dir "$(CARGO_TARGET_DIR)/robots"
-	@install -m 755 "$(CARGO_TARGET_DIR)/robots/debug/robot-with-roslibrust" "$(CARGO_TARGET_DIR)/debug/robot-with-roslibrust"
+	@scripts/robots "$(CACHE)" "$(CARGO_TARGET_DIR)/debug"
 
 .PHONY: stories
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
