@@ -175,8 +175,19 @@ test-web: build-dev ## the page in a real browser, against a real daemon; screen
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
 	@scripts/deps build run vm
 	@echo "== stories in a virtual machine"
-	@cargo test $(DEV) -q --test vm --no-run
-	@tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
+	@VM_STORIES="$$(cargo test $(DEV) -q --test vm --no-run --message-format=json | sed -n 's/.*"executable":"\([^"]*\/vm-[^"]*\)".*/\1/p')" \
+	  tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
+
+# What the virtual machine is made of takes minutes once, and depends on little: it is made beside what comes before it.
+.PHONY: vm-image
+vm-image:
+	@scripts/deps vm
+	@tests/vm/run --image
+
+.PHONY: vm-home
+vm-home: build-dev
+	@scripts/deps build run vm
+	@tests/vm/run --home "$(CARGO_TARGET_DIR)/debug"
 
 .PHONY: bench
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
