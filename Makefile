@@ -66,13 +66,13 @@ stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it 
 .PHONY: stub-cross-dev
 stub-cross-dev:
 	@scripts/deps run
-	@scripts/stub-cross "$(CACHE)" stub-test "$(CARGO_TARGET_DIR)/debug"
+	@scripts/stub-cross "$(CACHE)" stub-test "$(PROGRAMS)"
 
 .PHONY: test-cross
 test-cross: stub-cross-dev build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
-	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" cargo test $(DEV) --test stories -- cross::
+	@CLOUDROID_CROSS="$$(cat "$(PROGRAMS)/cross-built")" CLOUDROID_BIN="$(PROGRAMS)" cargo test $(DEV) --test stories -- cross::
 
 # The daemon is compiled with the page that stands in web/dist. Nothing is done where web/ has not changed.
 .PHONY: web
@@ -92,6 +92,9 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 # has a set of its own.
 DEV := --locked --workspace
 
+# Those of its programs that are tested, of this checkout alone.
+PROGRAMS := $(CARGO_TARGET_DIR)/checkouts/$(shell pwd -P | sha256sum | cut -c1-12)
+
 # Puts what the daemon looks for beside a daemon that was built by profile $(1).
 define beside
 	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/$(1)/cloudroid-init"
@@ -101,8 +104,7 @@ endef
 
 .PHONY: build-dev
 build-dev: init web
-	@cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --bin eval --test stories
-	$(call beside,debug)
+	@scripts/programs "$(PROGRAMS)" cargo build $(DEV) --bin cloudroidd --bin cloudroidctl --bin cloudroid-stub --bin eval --test stories
 
 .PHONY: build-demo
 build-demo: init web
@@ -158,25 +160,25 @@ unit: build-dev ## the crates' own tests; SEED=n for other random cases than the
 
 .PHONY: robots
 robots:
-	@scripts/robots "$(CACHE)" "$(CARGO_TARGET_DIR)/debug"
+	@scripts/robots "$(CACHE)" "$(PROGRAMS)"
 
 .PHONY: stories
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
 	@echo "== stories"
-	@cargo test $(DEV) --test stories -- $(ONLY)
+	@CLOUDROID_BIN="$(PROGRAMS)" cargo test $(DEV) --test stories -- $(ONLY)
 
 .PHONY: test-web
 test-web: build-dev ## the page in a real browser, against a real daemon; screenshots are below target/web
 	@scripts/node "$(WEB_TEST)" tests/web/package.json
 	@echo "== the page in Chromium"
-	@cargo test $(DEV) --test stories -- page::
+	@CLOUDROID_BIN="$(PROGRAMS)" cargo test $(DEV) --test stories -- page::
 
 .PHONY: test-vm
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
 	@scripts/deps build run vm
 	@echo "== stories in a virtual machine"
 	@VM_STORIES="$$(cargo test $(DEV) -q --test vm --no-run --message-format=json | sed -n 's/.*"executable":"\([^"]*\/vm-[^"]*\)".*/\1/p')" \
-	  tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
+	  tests/vm/run "$(PROGRAMS)" $(ONLY)
 
 # What the virtual machine is made of takes minutes once, and depends on little: it is made beside what comes before it.
 .PHONY: vm-image
@@ -187,7 +189,7 @@ vm-image:
 .PHONY: vm-home
 vm-home: build-dev
 	@scripts/deps build run vm
-	@tests/vm/run --home "$(CARGO_TARGET_DIR)/debug"
+	@tests/vm/run --home "$(PROGRAMS)"
 
 .PHONY: bench
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
@@ -223,7 +225,7 @@ EVAL_WORDS = $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))
 eval-quick: test-deps build-dev
 	@scripts/deps build run test eval
 	@echo "== quick evaluation"
-	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/debug" "$(CARGO_TARGET_DIR)/debug/eval" --quick $(EVAL_WORDS)
+	@CLOUDROID_BIN="$(PROGRAMS)" "$(PROGRAMS)/eval" --quick $(EVAL_WORDS)
 
 # What was measured before a change says nothing of it. What could not be measured is tried once more.
 .PHONY: test-eval
