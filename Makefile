@@ -123,7 +123,7 @@ demo: demo-ros demo-deps build-demo ## push Debian's people_detect and find peop
 
 .PHONY: test
 test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took
-	@scripts/parts room test-deps build-dev lint unit robots stories test-eval vm-image vm-home test-vm $(ALSO)
+	@scripts/parts room test-deps vm-image robots build-dev lint unit vm-home test-vm test-eval stories $(ALSO)
 
 .PHONY: room
 room:
