@@ -70,13 +70,13 @@ stub-cross: ## build the robot's program for aarch64 and armv7, too, and try it 
 .PHONY: stub-cross-dev
 stub-cross-dev:
 	@scripts/deps run
-	@scripts/stub-cross "$(CACHE)" stub-test "$(CARGO_TARGET_DIR)/debug"
+	@scripts/stub-cross "$(CACHE)" stub-test "$(PROGRAMS)"
 
 .PHONY: test-cross
 test-cross: stub-cross-dev build-dev ## robots of those architectures, told as stories under qemu (as root; the first time takes long)
 	@scripts/deps build run test cross
 	@echo "== stories of other architectures"
-	@CLOUDROID_CROSS="$$(cat "$(CACHE)/cross-built")" $(TELL) cross::
+	@CLOUDROID_CROSS="$$(cat "$(PROGRAMS)/cross-built")" $(TELL) cross::
 
 # The daemon is compiled with the page that stands in web/dist. Nothing is done where web/ has not changed.
 .PHONY: web
@@ -96,6 +96,9 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 # has a set of its own. Built with it are the lints, too (scripts/rustc), and the video codec, which no program of a release has.
 DEV := --locked --workspace --features codec/video
 
+# Those of its programs that are tested, of this checkout alone.
+PROGRAMS := $(CARGO_TARGET_DIR)/checkouts/$(shell pwd -P | sha256sum | cut -c1-12)
+
 # Puts what the daemon looks for beside a daemon that was built by profile $(1).
 define beside
 	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/$(1)/cloudroid-init"
@@ -105,12 +108,11 @@ endef
 
 .PHONY: beside-dev
 beside-dev:
-	$(call beside,debug)
+	@scripts/programs "$(PROGRAMS)" true
 
 .PHONY: build-dev
 build-dev: init web
-	@cargo build $(DEV) --all-targets
-	$(call beside,debug)
+	@scripts/programs "$(PROGRAMS)" cargo build $(DEV) --all-targets
 
 .PHONY: build-demo
 build-demo: init web
@@ -129,7 +131,7 @@ demo: demo-ros demo-deps build-demo ## push Debian's people_detect and find peop
 
 .PHONY: test
 test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took
-	@scripts/parts room test-deps lint unit stories test-eval test-vm
+	@scripts/parts room test-deps vm-image robots build-dev lint unit vm-home test-vm test-eval stories $(ALSO)
 
 .PHONY: room
 room:
@@ -169,12 +171,11 @@ unit: build-dev ## the crates' own tests; ONLY="ros link" those of some, SEED=n 
 endif
 
 # The stories are a test target of Cargo's that says so and ends where it is run with all others.
-TELL := CLOUDROID_STORIES=1 cargo test $(DEV) --test stories --
+TELL := CLOUDROID_STORIES=1 CLOUDROID_BIN="$(PROGRAMS)" cargo test $(DEV) --test stories --
 
 .PHONY: robots
 robots:
-	@cargo build -q --locked --manifest-path tests/robots/roslibrust/Cargo.toml --target-dir "$(CARGO_TARGET_DIR)/robots"
-	@install -m 755 "$(CARGO_TARGET_DIR)/robots/debug/robot-with-roslibrust" "$(CARGO_TARGET_DIR)/debug/robot-with-roslibrust"
+	@scripts/robots "$(CACHE)" "$(PROGRAMS)"
 
 .PHONY: stories
 stories: build-dev robots ## the whole system, told as stories; ONLY=name runs those whose name contains it
@@ -191,7 +192,19 @@ test-web: build-dev ## the page in a real browser, against a real daemon; screen
 test-vm: build-dev ## what needs systemd, cgroup v2 and power cuts, in a virtual machine; ONLY=name for some
 	@scripts/deps build run vm
 	@echo "== stories in a virtual machine"
-	@tests/vm/run "$(CARGO_TARGET_DIR)/debug" $(ONLY)
+	@VM_STORIES="$$(cargo test $(DEV) -q --test vm --no-run --message-format=json | sed -n 's/.*"executable":"\([^"]*\/vm-[^"]*\)".*/\1/p')" \
+	  tests/vm/run "$(PROGRAMS)" $(ONLY)
+
+# What the virtual machine is made of takes minutes once, and depends on little: it is made beside what comes before it.
+.PHONY: vm-image
+vm-image:
+	@scripts/deps vm
+	@tests/vm/run --image
+
+.PHONY: vm-home
+vm-home: build-dev
+	@scripts/deps build run vm
+	@tests/vm/run --home "$(PROGRAMS)"
 
 .PHONY: bench
 bench: test-deps build ## every measurement with its peer in the same run; ONLY=name for one
@@ -227,7 +240,7 @@ EVAL_WORDS = $(if $(FRESH),--fresh) $(if $(ONLY),--only $(ONLY))
 eval-quick: test-deps build-dev
 	@scripts/deps build run test eval
 	@echo "== quick evaluation"
-	@CLOUDROID_BIN="$(CARGO_TARGET_DIR)/debug" "$(CARGO_TARGET_DIR)/debug/eval" --quick $(EVAL_WORDS)
+	@CLOUDROID_BIN="$(PROGRAMS)" "$(PROGRAMS)/eval" --quick $(EVAL_WORDS)
 
 # What was measured before a change says nothing of it. What could not be measured is tried once more.
 .PHONY: test-eval

@@ -68,9 +68,9 @@ const SUBJECTS: [Subject; 3] = [
 
 /// What a quick evaluation measures.
 const QUICK: Subject = Subject {
-    fitted: &[0.25, 0.5, 0.75],
-    held_back: &[0.35, 1.0],
-    requests: 10,
+    fitted: &[0.25, 0.5, 1.0],
+    held_back: &[0.75],
+    requests: 6,
     ..SUBJECTS[0]
 };
 

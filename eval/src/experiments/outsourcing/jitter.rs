@@ -2,8 +2,7 @@
 
 use anyhow::Result;
 
-use super::{Run, SetUp, find, missing};
-use crate::examples::ALL;
+use super::{Run, SetUp, examples, find, missing};
 use crate::place::Network;
 use crate::plots;
 use crate::section::{Section, Table};
@@ -62,7 +61,7 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
         }
     }
     section.tables.push(table);
-    for example in ALL {
+    for example in examples(runs) {
         let of = runs.iter().filter(|run| run.example.name == example.name);
         let series = of.filter_map(|run| {
             let name = format!("{}, {}", run.class.name(), run.set_up.name());

@@ -2,8 +2,7 @@
 
 use anyhow::Result;
 
-use super::{Run, SetUp, find, missing};
-use crate::examples::ALL;
+use super::{Run, SetUp, examples, find, missing};
 use crate::place::Network;
 use crate::plots::{self, Series};
 use crate::section::{Section, Table};
@@ -93,7 +92,7 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
         }
     }
     section.tables.push(table);
-    for example in ALL {
+    for example in examples(runs) {
         let series = |of: fn(&Trace) -> Vec<(f64, f64)>| -> Vec<Series> {
             let done = runs.iter().filter(|run| run.example.name == example.name);
             let one = |run: &Run| {
