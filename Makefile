@@ -27,7 +27,7 @@ PREFIX ?= /usr/local
 
 .PHONY: check
 check: ## after each change, within minutes: tests and stories of the crates that changed; DRY=1 only says which, BASE=commit since when
-	@DEV="$(DEV)" SEED="$(SEED)" BASE="$(BASE)" DRY="$(DRY)" scripts/check
+	@CLOUDROID_STORIES=1 CLOUDROID_BIN="$(PROGRAMS)" DEV="$(DEV)" SEED="$(SEED)" BASE="$(BASE)" DRY="$(DRY)" scripts/check
 
 .PHONY: help
 help: ## what can be asked for

@@ -108,7 +108,7 @@ impl Store {
     }
 
     /// Gives a tree that is complete its name.
-    fn appear(&self, half_made: HalfMadeTree, diff_id: &Digest) -> Result<(), Error> {
+    pub(crate) fn appear(&self, half_made: HalfMadeTree, diff_id: &Digest) -> Result<(), Error> {
         let tree = self.tree_path(diff_id);
         if tree.exists() {
             return Ok(());
@@ -209,7 +209,7 @@ impl Store {
 
 /// Writes the entries of a tar stream below `tree`; gives the digest and the bytes of the stream. `label` and `path` are
 /// where it came from, for messages.
-fn fill(
+pub(crate) fn fill(
     tree: &Path,
     content: &mut dyn std::io::Read,
     label: &str,
@@ -241,13 +241,13 @@ fn boot_id() -> Result<String, Error> {
 }
 
 /// A directory under a temporary name, locked while it is filled, and removed unless it was renamed.
-struct HalfMadeTree {
-    path: PathBuf,
+pub(crate) struct HalfMadeTree {
+    pub(crate) path: PathBuf,
     _lock: Lock,
 }
 
 impl HalfMadeTree {
-    fn create(directory: &Path) -> Result<Self, Error> {
+    pub(crate) fn create(directory: &Path) -> Result<Self, Error> {
         loop {
             let path = directory.join(files::half_made_name());
             debug_assert!(

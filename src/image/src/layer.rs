@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::digest::Hashing;
 use crate::entry::shown;
+use crate::extract::{HalfMadeTree, fill};
 use crate::files::{self, NewFile};
 use crate::gzip::{self, Failed};
 use crate::store::{MAX_DOCUMENT, json};
@@ -103,18 +104,27 @@ impl Store {
         Ok(layer)
     }
 
-    /// Copies a `tar.gz` into the store as a layer. Its digest and diff-id are found on the way.
+    /// Copies a `tar.gz` into the store as a layer, and extracts it: in one pass, since decompressing takes longer than all else. Its digest
+    /// and diff-id are found on the way.
     pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
         let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
+        let needed = file.metadata().map_or(0, |metadata| metadata.len());
+        let label = archive.display().to_string();
+        let tree = HalfMadeTree::create(self.layers_dir())?;
         let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
-            gunzip_and_hash(copy).map_err(|error| match error.kind() {
-                io::ErrorKind::UnexpectedEof
-                | io::ErrorKind::InvalidInput
-                | io::ErrorKind::InvalidData => malformed(archive, error),
-                _ => Error::file("read", archive, error),
+            let content =
+                gzip::decoder(copy).map_err(|error| Error::file("read", archive, error))?;
+            gzip::reading_ahead(content, |content| {
+                fill(&tree.path, content, &label, archive)
+            })
+            .map_err(|error| match error {
+                Error::File { source, .. } if is_damage(&source) => malformed(archive, source),
+                error => error.needing(needed),
             })
         };
-        self.copy_layer(file, archive, read, |_| Ok(()))
+        let layer = self.copy_layer(file, archive, read, |_| Ok(()))?;
+        self.appear(tree, &layer.diff_id)?;
+        Ok(layer)
     }
 
     /// The same of a file that strangers have written, called `label`, which may not hold more than `limits`; gives the number of its
@@ -139,7 +149,7 @@ impl Store {
     }
 
     /// Copies what `read` reads, which finds the digest and the bytes of the content, and keeps it if `accept` takes it.
-    fn copy_layer(
+    pub(crate) fn copy_layer(
         &self,
         file: File,
         archive: &Path,
@@ -325,6 +335,12 @@ fn check_gzip(file: &File, path: &Path) -> Result<(), Error> {
     }
 }
 
+/// Tells if what was read is wrong, and not the reading of it.
+fn is_damage(error: &io::Error) -> bool {
+    use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
+    [UnexpectedEof, InvalidInput, InvalidData].contains(&error.kind())
+}
+
 fn malformed(archive: &Path, problem: impl ToString) -> Error {
     let problem = Refusal::Malformed {
         after: String::new(),
@@ -337,7 +353,7 @@ fn malformed(archive: &Path, problem: impl ToString) -> Error {
 }
 
 /// Writes down all that is read from it.
-struct Tee<R, W> {
+pub(crate) struct Tee<R, W> {
     from: R,
     to: W,
     /// Writing failed, which the reader sees as a failure to read.
