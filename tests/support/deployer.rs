@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, ensure};
 use serde_json::Value;
 
+use crate::layer_pool::FirstPush;
 use crate::{binaries, cores};
 
 /// Types commands to one daemon.
@@ -80,10 +81,15 @@ impl Deployer {
             .iter()
             .any(|word| ["push", "import"].contains(word));
         let _core = is_work.then(cores::acquire);
-        run(Command::new(binaries::path("cloudroidctl"))
+        let push = FirstPush::begin(&self.home, &arguments);
+        let outcome = run(Command::new(binaries::path("cloudroidctl"))
             .args(&arguments)
             .env("CLOUDROID_HOME", &self.home)
-            .env_remove("CLOUDROID_SERVER"))
+            .env_remove("CLOUDROID_SERVER"))?;
+        if let Some(push) = push.filter(|_| outcome.status == 0) {
+            push.keep();
+        }
+        Ok(outcome)
     }
 
     /// Types it with `--format json` and reads the answer.

@@ -15,6 +15,7 @@ pub mod disk;
 pub mod evidence;
 pub mod freezer;
 pub mod grants;
+mod layer_pool;
 pub mod layout;
 pub mod leftovers;
 pub mod machine;
