@@ -37,6 +37,7 @@ fn fail_once() -> Verdict {
 
 fn fail_once_with_a_daemon() -> Verdict {
     let daemon = world().own("rehearsal").start()?;
+    GREETER.push_to(&daemon)?;
     let directory = world().directory("rehearsed")?;
     std::fs::write(directory.path().join("note"), "kept")?;
     fail_once()?;

@@ -86,7 +86,7 @@ pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
         ("machine", "/proc/loadavg"),
         ("ps", "PID"),
         ("homes/rehearsal/daemon.log", "listen"),
-        ("homes/rehearsal/events.jsonl", "\"kind\""),
+        ("homes/rehearsal/events.jsonl", "greeter_cpp"),
     ] {
         ensure!(read(name)?.contains(word), "{name}: {}", read(name)?);
     }

@@ -650,7 +650,12 @@ const STEPS = {
     await visitor.clicks('Publish');
     await visitor.sees('"by the form"');
     await chooses('Topic', '/tf');
-    await visitor.clicks('Add to transforms');
+    // Messages that come meanwhile may move the button away from under the pointer.
+    const added = '::-p-aria([name="transforms[0].child_frame_id"])';
+    for (let tries = 0; tries < 30 && !(await page.$(`form[aria-label="Publish"] ${added}`)); tries += 1) {
+      await visitor.clicks('Add to transforms');
+      await page.waitForSelector(`form[aria-label="Publish"] ${added}`, { timeout: 2000 }).catch(() => {});
+    }
     await visitor.fills('Publish', 'transforms[0].child_frame_id', 'held');
     for (const part of ['header', 'transform', 'rotation']) await page.locator(`form[aria-label="Publish"] details:not([open]) ::-p-text(${part})`).click();
     await visitor.fills('Publish', 'transforms[0].header.frame_id', 'base_link');

@@ -321,7 +321,9 @@ fn sockets(tried: &mut Tried, home: &Path) -> anyhow::Result<()> {
     {
         let abstract_name = name
             .strip_prefix('@')
-            .filter(|name| name.contains("cloudroid"));
+            .filter(|name| name.contains("cloudroid"))
+            // Robots of other stories take their domains of ROS 2 by these.
+            .filter(|name| !name.starts_with("cloudroid-domain-"));
         let address = match abstract_name {
             Some(name) => SocketAddr::from_abstract_name(name)?,
             None if name.starts_with(&home) => SocketAddr::from_pathname(name)?,
