@@ -13,6 +13,9 @@ const LONGEST: usize = 20;
 /// How many characters of a reason are printed.
 const REASON: usize = 2000;
 
+/// How many characters of the reason of a flaky one are printed, in a line.
+const LINE: usize = 300;
+
 /// A run's end.
 pub(super) struct Report {
     told: Vec<Outcome>,
@@ -85,7 +88,9 @@ impl Report {
             patience::busiest()
         );
         for (name, reason) in &self.flaky {
-            println!("FLAKY {name}: {}", shorten(reason));
+            let words: Vec<&str> = reason.split_whitespace().collect();
+            let first: String = words.join(" ").chars().take(LINE).collect();
+            println!("FLAKY {name}: {first}");
             println!("      kept below {}", evidence_of(name, 1).display());
             note_flaky(name, reason);
         }
