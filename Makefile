@@ -164,7 +164,7 @@ unit:
 else
 unit: build-dev ## the crates' own tests; ONLY="ros link" those of some, SEED=n for other random cases than the usual
 	@echo "== unit tests"
-	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --all-targets
+	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --tests --no-fail-fast
 	@echo "== the codec without video"
 	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties -- a_build_without_video
 

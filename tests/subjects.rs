@@ -64,6 +64,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("shadowing", &["catalogue", "package", "sign"]),
     ("sharing", &["reach"]),
     ("survival", &["cloudroidd", "servant", "store"]),
+    ("telling", &["stories"]),
     ("terms", &["choreographer"]),
     ("tls", &["cloudroidd", "tls"]),
     ("tokens", &["portal", "store"]),
