@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 use clap::Parser;
 use support::story::{self, Telling};
 use support::world::world;
-use support::{Verdict, binaries, evidence};
+use support::{Verdict, binaries, claim, evidence};
 
 use record::Record;
 use report::Report;
@@ -104,6 +104,7 @@ pub fn run(stories: Vec<Story>, alone: &[&str]) -> ExitCode {
     }
     if let Err(lack) = machine::prepare() {
         eprintln!("the stories cannot be told here: {lack}");
+        support::world::end();
         return ExitCode::FAILURE;
     }
     let record = Record::read();
@@ -238,6 +239,12 @@ fn tell(story: &Story, attempt: usize) -> Outcome {
         let shared = world().shared_daemon();
         if let Err(error) = evidence::keep(&telling, reason, &seed, shared.as_deref()) {
             eprintln!("nothing is kept of {}: {error}", story.name);
+        }
+        // A daemon that was killed leaves servants, and the second telling is to find nothing of the first.
+        for home in telling.homes() {
+            if let Err(error) = claim::end_users(&home) {
+                eprintln!("{}: {error:#}", story.name);
+            }
         }
     }
     for directory in telling.directories() {

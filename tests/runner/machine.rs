@@ -19,6 +19,7 @@ pub(super) fn prepare() -> Result<(), String> {
         return Err("servants are started by root: sudo make stories".to_owned());
     }
     check_cgroups()?;
+    disk::enter_namespace().map_err(|error| format!("{error:#}, and robots' file systems are mounted: run the stories as root of the machine"))?;
     for place in claim::find_abandoned(&std::env::temp_dir(), world::PREFIX) {
         match claim::remove_abandoned(&place) {
             Ok(()) => println!(

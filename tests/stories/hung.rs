@@ -23,8 +23,8 @@ pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
             .then_some(())
             .ok_or_else(|| status.to_string()))
     })?;
-    // Twice as long it hangs: before it is stopped it is not to be taken for that.
-    let rrt = scale_seconds(1);
+    // Twice as long it hangs: before it is stopped it is not to be taken for that, and meanwhile the bridge finds that it cannot connect.
+    let rrt = scale_seconds(1).max(6);
     let mut robot = daemon.robot(&format!("adder_py?robot=one&rrt={rrt}s"))?;
     let sum = json!({"a": 1, "b": 1});
     robot.calls("/add_two", sum.clone())?;

@@ -45,8 +45,25 @@ pub fn find_abandoned(parent: &Path, prefix: &str) -> Vec<PathBuf> {
 /// # Errors
 /// Names the first thing that could not be removed.
 pub fn remove_abandoned(directory: &Path) -> anyhow::Result<()> {
+    end_users(directory)?;
+    leftovers::unmount_below(directory);
+    match fs::remove_dir_all(directory) {
+        // Two runs may begin at once.
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        removed => removed.with_context(|| directory.display().to_string()),
+    }
+}
+
+/// Ends the processes that use a directory, but for those that this one was started by, and removes their cgroups.
+///
+/// # Errors
+/// Names the first thing that stays.
+pub fn end_users(directory: &Path) -> anyhow::Result<()> {
     // In a servant's mount namespace nothing of the directory needs to be seen: its processes are known by their parents.
-    let pids = procfs::with_descendants(&leftovers::processes_of(directory));
+    let own = procfs::ancestors(std::process::id() as i32);
+    let mut users = leftovers::processes_of(directory);
+    users.retain(|pid| !own.contains(pid));
+    let pids = procfs::with_descendants(&users);
     let mut cgroups: Vec<PathBuf> = pids
         .iter()
         .flat_map(|pid| procfs::cgroups(*pid))
@@ -74,8 +91,7 @@ pub fn remove_abandoned(directory: &Path) -> anyhow::Result<()> {
             std::thread::sleep(Duration::from_millis(20));
         }
     }
-    leftovers::unmount_below(directory);
-    fs::remove_dir_all(directory).with_context(|| directory.display().to_string())
+    Ok(())
 }
 
 /// Tells if the process that wrote this note is still there.

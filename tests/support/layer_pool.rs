@@ -109,7 +109,7 @@ fn link_layer(from: &Path, to: &Path, layer: &str) {
             return;
         }
     }
-    let half = to.join(format!("layers/tmp-linked-{layer}"));
+    let half = to.join(format!("layers/linking-{layer}"));
     let copied = Command::new("cp")
         .args(["-al", "--"])
         .arg(from.join("layers").join(layer))

@@ -27,6 +27,7 @@ pub fn of(home: &Path) -> Vec<String> {
 /// Processes that were started with a path of `home`, work in it, or have something below it mounted.
 pub fn processes_of(home: &Path) -> Vec<i32> {
     let own = std::process::id() as i32;
+    let namespace = procfs::namespace(own, "mnt");
     let home = home.to_string_lossy().into_owned();
     let refers = |pid: &i32| {
         let command = procfs::command_line(*pid).unwrap_or_default();
@@ -34,7 +35,8 @@ pub fn processes_of(home: &Path) -> Vec<i32> {
         let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
         command.contains(&home)
             || directory.starts_with(&home)
-            || mounted.contains(&format!("{home}/"))
+            // Whoever shares this namespace sees the same mounts, and need not use them.
+            || (procfs::namespace(*pid, "mnt") != namespace && mounted.contains(&format!("{home}/")))
     };
     procfs::pids()
         .into_iter()

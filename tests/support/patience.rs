@@ -199,7 +199,10 @@ impl Deadline {
         loop {
             match tokio::time::timeout(SLICE, &mut future).await {
                 Ok(output) => return Ok(output),
-                Err(_) if self.is_over() => bail!("it did not come; {}", describe_slowness()),
+                Err(_) if self.is_over() => {
+                    evidence::note_machine();
+                    bail!("it did not come; {}", describe_slowness())
+                }
                 Err(_) => {}
             }
         }

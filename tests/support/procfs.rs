@@ -96,3 +96,12 @@ pub fn with_descendants(pids: &[i32]) -> Vec<i32> {
     }
     all
 }
+
+/// The process that started this one, the one that started that, and so on.
+pub fn ancestors(pid: i32) -> Vec<i32> {
+    let parent = |pid: &i32| -> Option<i32> {
+        let parent = status(*pid)?.get("PPid")?.parse().ok()?;
+        (parent > 0).then_some(parent)
+    };
+    std::iter::successors(parent(&pid), parent).collect()
+}

@@ -104,6 +104,8 @@ metrics! {
     calls => "cloudroid_bridge_calls_total",
     /// Service calls from clients that failed.
     calls_failed => "cloudroid_bridge_calls_failed_total",
+    /// Service calls from clients that a node answered by a failure.
+    calls_denied => "cloudroid_bridge_calls_denied_total",
     /// Answers to service calls and goals of clients that were put into their queues.
     answers => "cloudroid_bridge_answers_total",
     /// Service calls that clients served.

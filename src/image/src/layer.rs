@@ -108,8 +108,8 @@ impl Store {
     /// and diff-id are found on the way.
     pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
         let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
-        let needed = file.metadata().map_or(0, |metadata| metadata.len());
         let label = archive.display().to_string();
+        let _hold = self.hold()?;
         let tree = HalfMadeTree::create(self.layers_dir())?;
         let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
             let content =
@@ -119,7 +119,7 @@ impl Store {
             })
             .map_err(|error| match error {
                 Error::File { source, .. } if is_damage(&source) => malformed(archive, source),
-                error => error.needing(needed),
+                error => error,
             })
         };
         let layer = self.copy_layer(file, archive, read, |_| Ok(()))?;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use access::Operation;
 use bytes::Bytes;
-use ros::bus::{Digest, ServiceType};
+use ros::bus::{BusError, CallFate, Digest, ServiceType};
 use ros::codec::{self, CborOptions, JsonOptions};
 use ros::schema::{MessageType, ServiceDef};
 use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
@@ -184,7 +184,18 @@ impl Client {
             let took = response.is_ok().then(|| asked.elapsed());
             self.shared.options.called.tell(took);
         }
-        let response = response.map_err(|error| error.to_string())?;
+        let response = response.map_err(|error| {
+            if matches!(
+                error,
+                BusError::CallFailed {
+                    fate: CallFate::Answered,
+                    ..
+                }
+            ) {
+                self.shared.metrics.calls_denied.add(1);
+            }
+            error.to_string()
+        })?;
         self.response_frame(call, def.as_deref().ok(), &response)
     }
 

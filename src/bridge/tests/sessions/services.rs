@@ -124,6 +124,9 @@ async fn calls_fail_with_a_reason() {
         );
         assert_eq!(answer["values"], reason);
     }
+    let metrics = world.bridge.metrics();
+    assert_eq!(metrics.calls_failed.get(), 4);
+    assert_eq!(metrics.calls_denied.get(), 1, "the others met no node");
 }
 
 #[tokio::test]
