@@ -160,11 +160,11 @@ SEED ?= 1
 .PHONY: unit
 ifneq ($(ONLY),)
 unit:
-	@DEV="$(DEV)" SEED="$(SEED)" scripts/check unit $(ONLY)
+	@CLOUDROID_BIN="$(PROGRAMS)" DEV="$(DEV)" SEED="$(SEED)" scripts/check unit $(ONLY)
 else
 unit: build-dev ## the crates' own tests; ONLY="ros link" those of some, SEED=n for other random cases than the usual
 	@echo "== unit tests"
-	@PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --tests --no-fail-fast
+	@CLOUDROID_BIN="$(PROGRAMS)" PROPTEST_RNG_SEED=$(SEED) cargo test $(DEV) --tests --no-fail-fast
 	@echo "== the codec without video"
 	@PROPTEST_RNG_SEED=$(SEED) cargo test --locked -p codec --test properties -- a_build_without_video
 
