@@ -547,6 +547,7 @@ fn main() -> ExitCode {
             nodes_end_as_ros_users_know_it,
             a_locked_database_is_named_and_waited_for,
             a_full_disk_is_named_and_robots_at_work_stay,
+            what_a_full_disk_refuses_is_not_done,
         ],
         stories![acme:
             a_certificate_is_asked_for_and_renewed,

@@ -4,8 +4,9 @@ use std::path::Path;
 
 use anyhow::ensure;
 use support::Verdict;
-use support::daemon::Daemon;
+use support::daemon::{Daemon, Setup};
 use support::deployer::path_str;
+use support::small_disk::SmallDisk;
 use support::world::{ADDER, world};
 
 /// No service of this name, no build directory, no servant of it.
@@ -156,26 +157,13 @@ pub fn reserved_and_taken_names() -> Verdict {
 }
 
 pub fn a_full_disk_ends_a_push_and_nothing_else() -> Verdict {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-stories-small-")
-        .tempdir()?;
-    nix::mount::mount(
-        Some("tmpfs"),
-        place.path(),
-        Some("tmpfs"),
-        nix::mount::MsFlags::empty(),
-        Some("size=24M"),
-    )?;
-    let told = (|| {
-        let daemon = support::daemon::Setup::new(&place.path().join("home")).start()?;
-        daemon
-            .deployer()
-            .pushes("adder_py", &["--node", "adder.py"])?
-            .failed_saying(&["no space"])?;
-        nothing_half_made(&daemon, "adder_py")?;
-        ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
-        Ok(())
-    })();
-    nix::mount::umount2(place.path(), nix::mount::MntFlags::MNT_DETACH)?;
-    told
+    let disk = SmallDisk::mount("small", "24M")?;
+    let daemon = Setup::new(&disk.home()).start()?;
+    daemon
+        .deployer()
+        .pushes("adder_py", &["--node", "adder.py"])?
+        .failed_saying(&["no space"])?;
+    nothing_half_made(&daemon, "adder_py")?;
+    ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
+    Ok(())
 }

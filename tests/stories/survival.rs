@@ -13,6 +13,7 @@ use support::daemon::{Daemon, Setup};
 use support::deployer::run;
 use support::patience::{self, Deadline, patience};
 use support::robot::Robot;
+use support::small_disk::SmallDisk;
 use support::world::world;
 use support::{Verdict, leftovers, procfs};
 
@@ -413,55 +414,85 @@ pub fn a_locked_database_is_named_and_waited_for() -> Verdict {
 }
 
 pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Verdict {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-stories-full-")
-        .tempdir()?;
-    let flags = nix::mount::MsFlags::empty();
-    nix::mount::mount(
-        Some("tmpfs"),
-        place.path(),
-        Some("tmpfs"),
-        flags,
-        Some("size=1500M"),
-    )?;
-    let told = (|| {
-        let daemon = Setup::new(&place.path().join("home")).start()?;
-        daemon
-            .deployer()
-            .pushes(GREETER.0, GREETER.1)?
-            .succeeded()?;
-        let mut early = daemon.robot("greeter_cpp?robot=early")?;
-        ensure!(early.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
-        let filler = place.path().join("filler");
-        // Ends when nothing more fits.
-        let _ = std::io::copy(
-            &mut std::io::repeat(1),
-            &mut std::fs::File::create(&filler)?,
-        );
-        let words = match Robot::try_connect(&daemon.url("greeter_cpp?robot=late")) {
-            Err(refusal) => refusal.to_string(),
-            Ok(mut robot) => format!("{:?}", robot.hears_close()?),
-        };
-        ensure!(words.contains("space") || words.contains("full"), "{words}");
-        ensure!(
-            early.calls("/greeter/count", json!({"reset": false}))?["result"] == true,
-            "at work"
-        );
-        // Who was here is let in again.
-        early.leaves()?;
-        let mut early = daemon.robot("greeter_cpp?robot=early")?;
-        ensure!(early.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
-        let unwritable = event(&daemon, "state-unwritable", &["its disk is full"])?;
-        ensure!(warnings(&daemon)?.contains("its disk is full"));
-        ensure!(daemon.get("/healthz")?.0 == 200);
-        std::fs::remove_file(&filler)?;
-        event(&daemon, "state-writable", &["can be written again"])?;
-        is_in_the_database(&daemon, &unwritable)?;
-        let mut late = daemon.robot("greeter_cpp?robot=late")?;
-        ensure!(late.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
-        drop((early, late));
-        nothing_is_left(daemon)
-    })();
-    nix::mount::umount2(place.path(), nix::mount::MntFlags::MNT_DETACH)?;
-    told
+    let disk = SmallDisk::mount("full", "1500M")?;
+    let daemon = Setup::new(&disk.home()).start()?;
+    daemon
+        .deployer()
+        .pushes(GREETER.0, GREETER.1)?
+        .succeeded()?;
+    let mut early = daemon.robot("greeter_cpp?robot=early")?;
+    ensure!(early.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    disk.fill()?;
+    let words = match Robot::try_connect(&daemon.url("greeter_cpp?robot=late")) {
+        Err(refusal) => refusal.to_string(),
+        Ok(mut robot) => format!("{:?}", robot.hears_close()?),
+    };
+    ensure!(words.contains("space") || words.contains("full"), "{words}");
+    ensure!(
+        early.calls("/greeter/count", json!({"reset": false}))?["result"] == true,
+        "at work"
+    );
+    // Who was here is let in again.
+    early.leaves()?;
+    let mut early = daemon.robot("greeter_cpp?robot=early")?;
+    ensure!(early.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    let unwritable = event(&daemon, "state-unwritable", &["its disk is full"])?;
+    ensure!(warnings(&daemon)?.contains("its disk is full"));
+    ensure!(daemon.get("/healthz")?.0 == 200);
+    disk.make_room()?;
+    event(&daemon, "state-writable", &["can be written again"])?;
+    is_in_the_database(&daemon, &unwritable)?;
+    let mut late = daemon.robot("greeter_cpp?robot=late")?;
+    ensure!(late.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    drop((early, late));
+    nothing_is_left(daemon)
+}
+
+pub fn what_a_full_disk_refuses_is_not_done() -> Verdict {
+    let disk = SmallDisk::mount("refusing", "32M")?;
+    let setup = Setup::new(&disk.home());
+    let daemon = setup.start()?;
+    let deployer = daemon.deployer();
+    let create = |name| {
+        [
+            "token",
+            "create",
+            name,
+            "--role",
+            "viewer",
+            "--services",
+            "*",
+        ]
+    };
+    deployer.types(&create("ada"))?.succeeded()?;
+    disk.fill()?;
+    // The secret of a token that is not kept would be worth nothing, and whoever revoked one would trust in it.
+    for refused in [
+        &create("eve")[..],
+        &["token", "rotate", "ada"],
+        &["token", "revoke", "ada"],
+        &["policy", "allow", "ada", "call:/x"],
+        &["pair", "rover", "--services", "*"],
+    ] {
+        deployer.types(refused)?.failed_saying(&["full"])?;
+    }
+    disk.make_room()?;
+    event(&daemon, "state-writable", &["can be written again"])?;
+    daemon.ends()?;
+    let daemon = setup.start()?;
+    let live = |daemon: &Daemon| -> anyhow::Result<Vec<String>> {
+        let tokens = daemon.deployer().asks(&["token", "list"])?;
+        let tokens = tokens.as_array().context("a list")?.iter();
+        let live = tokens.filter(|token| token["revoked"].is_null());
+        Ok(live.map(|token| token["name"].to_string()).collect())
+    };
+    ensure!(live(&daemon)? == ["\"ada\""], "{:?}", live(&daemon)?);
+    let rules = daemon.deployer().asks(&["policy", "list"])?.to_string();
+    ensure!(!rules.contains("ada"), "{rules}");
+    daemon
+        .deployer()
+        .types(&["token", "revoke", "ada"])?
+        .succeeded()?;
+    ensure!(live(&daemon)?.is_empty());
+    nothing_is_left(daemon)
 }

@@ -28,6 +28,7 @@ pub mod robot_network;
 pub mod ros_system;
 pub mod shaper;
 pub mod site;
+pub mod small_disk;
 pub mod story;
 pub mod tls;
 pub mod twins;

@@ -73,6 +73,7 @@ mod tests {
             image: format!("sha256:{number}"),
             published: 0,
             package: "p".into(),
+            owner: None,
             source: String::new(),
             flavour: Default::default(),
             plan: Default::default(),

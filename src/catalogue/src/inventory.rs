@@ -174,6 +174,7 @@ mod tests {
             image: images.put_image(&spec).expect("written").to_string(),
             published: 0,
             package: "p".into(),
+            owner: None,
             source: String::new(),
             flavour: Flavour::default(),
             plan: Plan {

@@ -95,11 +95,6 @@ impl Catalogue {
         Ok(true)
     }
 
-    /// Records whose a service is that nobody owns yet.
-    pub fn own(&self, service: &str, owner: &str) -> Result<(), Error> {
-        Ok(self.state.own_service(service, owner)?)
-    }
-
     /// Whether a stub that was made of revision `made_of`, with this image, can use `now`; or why not and what to do.
     pub fn fits(
         &self,

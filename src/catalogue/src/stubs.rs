@@ -322,6 +322,7 @@ mod tests {
             image: String::new(),
             published: 0,
             package: "p".into(),
+            owner: None,
             source: String::new(),
             flavour: Flavour {
                 ros: Version::Ros2,

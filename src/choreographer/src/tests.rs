@@ -18,6 +18,7 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
         image: image.into(),
         published: store::now(),
         package: "detect".into(),
+        owner: None,
         source: "a test".into(),
         flavour: Default::default(),
         plan: Plan {

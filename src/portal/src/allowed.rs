@@ -131,11 +131,16 @@ impl Caller {
         self.is_robot_of(&handle.robot) && self.sees(app, handle.service())
     }
 
-    /// Whether it is no robot, or this one.
-    pub fn is_robot_of(&self, robot: &str) -> bool {
+    /// The one robot that it is, where it is a robot that has a name.
+    pub fn own_robot(&self) -> Option<&str> {
         let principal = &self.who.principal;
         let own = principal.scope.robot.as_deref();
-        !principal.is(Role::Robot) || own.is_none_or(|own| own == robot)
+        own.filter(|_| principal.is(Role::Robot))
+    }
+
+    /// Whether it is no robot, or this one.
+    pub fn is_robot_of(&self, robot: &str) -> bool {
+        self.own_robot().is_none_or(|own| own == robot)
     }
 
     /// Whether it may do something to what is of a robot at a service: robots may to their own alone.

@@ -17,7 +17,7 @@ use servant::engine::LogStart;
 use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
-use super::allowed::at_robot;
+use super::audit::About;
 use super::body::{self, Held};
 use super::guard::Caller;
 use crate::app::App;
@@ -136,6 +136,7 @@ pub async fn rollback(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<ServiceDetail> {
     let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
@@ -145,7 +146,8 @@ pub async fn rollback(
         serde_json::from_slice(&body)
             .map_err(|error| Error::BadRequest(format!("the rollback cannot be read: {error}")))?
     };
-    app.pusher.rollback(&name, asked.revision).await?;
+    let current = app.pusher.rollback(&name, asked.revision).await?;
+    about.is(format!("service {name}: to revision {current}"));
     Ok(Json(views::service(&app, &name)?))
 }
 
@@ -162,12 +164,14 @@ pub async fn order_rollout(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<api::Rollout> {
     use api::rollout::RolloutOrder;
     let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let order: RolloutOrder = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the order cannot be read: {error}")))?;
+    about.is_set(&format!("service {name}"), &order);
     let choreographer = &app.choreographer;
     Ok(Json(match order {
         RolloutOrder::Start { revision, terms } => {
@@ -342,11 +346,13 @@ pub async fn set_limits(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<api::Servant> {
     let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
+    about.is_set(&format!("servant {id}"), &change);
     choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
     app.choreographer.set_limits(&id, change).await?;
     let handle = app.choreographer.servant(&id)?;
@@ -359,14 +365,7 @@ pub async fn explain(
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
 ) -> Answer<api::explain::Explanation> {
-    let explained = crate::explain::robot(&app.choreographer, &app.state, &name).await;
-    Ok(Json(explained.map_err(|mut error| {
-        if let Error::UnknownRobot { exists, .. } = &mut error {
-            let who = &caller.who.principal;
-            exists.retain(|robot| at_robot(who, Action::See, robot).is_ok());
-        }
-        error
-    })?))
+    Ok(Json(crate::explain::robot(&app, &caller, &name).await?))
 }
 
 /// Ends one servant.
@@ -392,7 +391,12 @@ pub async fn stop_servants(
     State(app): State<Arc<App>>,
     Query(of): Query<OfService>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
 ) -> Answer<Stopped> {
+    about.is(match &of.service {
+        Some(service) => format!("servants of service {service}"),
+        None => "all servants".to_owned(),
+    });
     match &of.service {
         Some(service) => caller.may_at(&app, Action::Operate, service, None)?,
         None => caller.may(Action::Operate, &Object::MACHINE)?,

@@ -11,7 +11,7 @@ use axum::http::Method;
 use axum::response::Response;
 use futures_util::StreamExt;
 use parking_lot::Mutex;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use store::{NewAudited, State};
 use tokio::sync::watch;
 use utoipa::IntoParams;
@@ -39,9 +39,32 @@ impl About {
         let _ = self.0.set(object);
     }
 
+    /// Names an object and the value that it is given, as JSON.
+    pub fn is_set(&self, object: &str, value: &impl Serialize) {
+        let value = serde_json::to_string(value).unwrap_or_default();
+        self.is(format!("{object}: {value}"));
+    }
+
     /// What was said, or else `object`.
     pub fn or(&self, object: &str) -> String {
         self.0.get().cloned().unwrap_or_else(|| object.to_owned())
+    }
+}
+
+/// What a principal did lately. What succeeded has a room of its own: however much fails, it hides nothing that was done.
+#[derive(Debug, Default)]
+struct Recent {
+    succeeded: Sparing,
+    failed: Sparing,
+}
+
+impl Recent {
+    fn room(&mut self, status: u16) -> &mut Sparing {
+        if status < 400 {
+            &mut self.succeeded
+        } else {
+            &mut self.failed
+        }
     }
 }
 
@@ -49,7 +72,7 @@ impl About {
 pub struct Audit {
     state: Arc<State>,
     /// Of each principal, so that nobody takes another's room.
-    alike: Mutex<HashMap<String, Sparing>>,
+    recent: Mutex<HashMap<String, Recent>>,
     last: watch::Sender<i64>,
 }
 
@@ -68,7 +91,7 @@ impl Audit {
     pub fn new(state: Arc<State>) -> Audit {
         Audit {
             state,
-            alike: Mutex::default(),
+            recent: Mutex::default(),
             last: watch::Sender::new(0),
         }
     }
@@ -99,9 +122,9 @@ impl Audit {
         let (did, object) = (&cut(did), &cut(object));
         let alike = format!("{address} {did} {object} {status}");
         let more = {
-            let mut all = self.alike.lock();
-            let of_it = all.entry(who.clone()).or_default();
-            of_it.ask(&alike, store::now())
+            let mut recent = self.recent.lock();
+            let own = recent.entry(who.clone()).or_default();
+            own.room(status).ask(&alike, store::now())
         };
         if let Some(more) = more {
             let what = What {

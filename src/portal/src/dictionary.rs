@@ -13,6 +13,7 @@ use store::{Journal, NewEvent};
 use utoipa::IntoParams;
 
 use super::api_v1::{Answer, held};
+use super::audit::About;
 use super::guard::{self, Caller};
 use crate::app::App;
 use crate::errors::Error;
@@ -31,12 +32,14 @@ pub async fn write(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<About>,
     body: Body,
 ) -> Answer<Vec<Row>> {
     let revision = app.catalogue.current(&name)?;
     let body = held(&app, &caller, body, LARGEST).await?.bytes;
     let new: NewRows = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the rows cannot be read: {error}")))?;
+    about.is_set(&format!("dictionary of service {name}"), &new);
     for row in &new.rows {
         check_row(row).map_err(|reason| Error::BadRequest(format!("row of {row}: {reason}")))?;
     }
@@ -69,7 +72,9 @@ pub async fn write(
 pub async fn remove(
     State(app): State<Arc<App>>,
     Path((name, id)): Path<(String, String)>,
+    Extension(about): Extension<About>,
 ) -> Answer<Vec<Row>> {
+    about.is(format!("row {id} of the dictionary of service {name}"));
     app.catalogue.current(&name)?;
     let number = id.parse().ok();
     let removed = match number {

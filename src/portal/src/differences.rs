@@ -241,6 +241,7 @@ mod tests {
             image: String::new(),
             published: 0,
             package: "p".into(),
+            owner: None,
             source: "/p".into(),
             flavour: ros::flavour::Flavour::default(),
             plan: store::Plan {

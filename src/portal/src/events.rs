@@ -1,6 +1,5 @@
 //! `/api/v1/events`: the journal, as it is and as it grows.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use axum::extract::State;
@@ -8,7 +7,7 @@ use axum::response::Response;
 use axum::{Extension, Json};
 use futures_util::StreamExt;
 use serde::Deserialize;
-use store::EventFilter;
+use store::{EventFilter, Told};
 use tokio::sync::watch;
 use utoipa::IntoParams;
 
@@ -48,30 +47,30 @@ impl Which {
         since: i64,
         limit: u32,
     ) -> Result<Vec<api::Event>, Error> {
+        let services = services_seen(app, caller)?;
+        let told = services.as_deref().map(|services| Told {
+            services,
+            own_robot: caller.who.principal.scope.robot.as_deref(),
+        });
         let filter = EventFilter {
             kind: self.kind.as_deref(),
             service: self.service.as_deref(),
             servant: self.servant.as_deref(),
             robot: self.robot.as_deref(),
+            told,
         };
-        if caller.who.principal.sees_all() {
-            return Ok(app.state.events_of(filter, since, limit)?);
-        }
-        // Of all that are kept: the newest may be of what others see alone.
-        let mut events = app.state.events_of(filter, since, u32::MAX)?;
-        let mut seen: HashMap<String, bool> = HashMap::new();
-        let mut sees = |service: &str| match seen.get(service) {
-            Some(sees) => *sees,
-            None => {
-                let sees = caller.sees(app, service);
-                seen.insert(service.to_owned(), sees);
-                sees
-            }
-        };
-        events.retain(|event| is_told(caller, event, &mut sees));
-        let beyond = events.len().saturating_sub(limit as usize);
-        Ok(events.split_off(beyond))
+        Ok(app.state.events_of(filter, since, limit)?)
     }
+}
+
+/// Services with events that the caller may see, by name; none where it sees all that there is.
+pub fn services_seen(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
+    if caller.who.principal.sees_all() {
+        return Ok(None);
+    }
+    let mut services = app.state.services_of_events()?;
+    services.retain(|service| caller.sees(app, service));
+    Ok(Some(services))
 }
 
 /// Whether somebody who does not see all is told of an event: a robot is told of itself, and everybody of services that they see;

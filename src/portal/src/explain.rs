@@ -10,9 +10,12 @@ use api::explain::{Explanation, Link, Part, Served, dominant};
 use link::control::{Refused, Request};
 use reach::links::LinkStatus;
 
+use crate::app::App;
 use crate::errors::Error;
+use crate::events::services_seen;
+use crate::guard::Caller;
 use choreographer::{Choreographer, Handle};
-use store::{EventFilter, State};
+use store::{EventFilter, Told};
 
 /// Between two looks at what a servant uses.
 const MOMENT: Duration = Duration::from_millis(400);
@@ -20,14 +23,12 @@ const MOMENT: Duration = Duration::from_millis(400);
 const EVENTS: u32 = 8;
 
 /// Explains one robot.
-pub async fn robot(
-    choreographer: &Choreographer,
-    state: &State,
-    name: &str,
-) -> Result<Explanation, Error> {
-    let all = choreographer.servants();
+pub async fn robot(app: &App, caller: &Caller, name: &str) -> Result<Explanation, Error> {
+    let choreographer = &app.choreographer;
+    let mut all = choreographer.servants();
+    all.retain(|handle| caller.sees_servant(app, handle));
     let mine: Vec<&Arc<Handle>> = all.iter().filter(|handle| handle.robot == name).collect();
-    let events = events(state, name)?;
+    let events = events(app, caller, name)?;
     if mine.is_empty() && events.is_empty() {
         let mut exists: Vec<String> = all.iter().map(|handle| handle.robot.clone()).collect();
         exists.sort();
@@ -48,12 +49,17 @@ pub async fn robot(
     })
 }
 
-fn events(state: &State, robot: &str) -> Result<Vec<Event>, Error> {
+fn events(app: &App, caller: &Caller, robot: &str) -> Result<Vec<Event>, Error> {
+    let services = services_seen(app, caller)?;
     let of_it = EventFilter {
         robot: Some(robot),
+        told: services.as_deref().map(|services| Told {
+            services,
+            own_robot: Some(robot),
+        }),
         ..EventFilter::default()
     };
-    Ok(state.events_of(of_it, 0, EVENTS)?)
+    Ok(app.state.events_of(of_it, 0, EVENTS)?)
 }
 
 async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {

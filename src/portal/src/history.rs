@@ -10,7 +10,7 @@ use api::history::{MachineHistory, ServantHistory};
 use axum::extract::State;
 use axum::{Extension, Json};
 use serde::Deserialize;
-use store::{RecordedFilter, RecordedLine};
+use store::{RecordedFilter, RecordedLine, Told};
 use utoipa::IntoParams;
 
 use crate::api_v1::Answer;
@@ -126,14 +126,19 @@ pub async fn servants(
         to: whose.to,
         step: whose.step,
     })?;
+    let services = services_seen(&app, &caller)?;
     let filter = RecordedFilter {
         // The machine's has an address of its own.
         servant: whose.servant.as_deref(),
         service: whose.service.as_deref(),
         robot: whose.robot.as_deref(),
+        told: services.as_deref().map(|services| Told {
+            services,
+            own_robot: caller.own_robot(),
+        }),
     };
     let mut found = app.state.recorded(filter, asked.from, SERVANTS)?;
-    found.retain(|one| one.servant != recorder::THE_MACHINE && sees(&app, &caller, one));
+    found.retain(|one| one.servant != recorder::THE_MACHINE);
     let mut left = MOST;
     let mut told = Vec::new();
     for one in found {
@@ -149,8 +154,14 @@ pub async fn servants(
     Ok(Json(told))
 }
 
-fn sees(app: &App, caller: &Caller, one: &RecordedLine) -> bool {
-    caller.is_robot_of(&one.robot) && caller.sees(app, &one.service)
+/// Services with samples that the caller may see, by name; none where it sees all that there is.
+fn services_seen(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
+    if caller.who.principal.sees_all() {
+        return Ok(None);
+    }
+    let mut services = app.state.services_recorded()?;
+    services.retain(|service| caller.sees(app, service));
+    Ok(Some(services))
 }
 
 fn history(

@@ -52,7 +52,7 @@ pub async fn create(
     body: Body,
 ) -> Answer<Secret> {
     let new: NewToken = read(&app, &caller, body, "token").await?;
-    about.is(format!("token {} ({})", new.name, new.role));
+    about.is_set("token", &new);
     let first = app.principals.names_nobody();
     let made = app.principals.create(&new)?;
     if first {
@@ -112,10 +112,19 @@ pub async fn remove_rule(
     Path(id): Path<String>,
     Extension(about): Extension<About>,
 ) -> Answer<Vec<Rule>> {
-    about.is(format!("rule {id}"));
-    let removed = match id.parse() {
-        Ok(number) => app.principals.remove_rule(number)?,
-        Err(_) => false,
+    let number = id.parse().ok();
+    let named = app
+        .principals
+        .rules()
+        .into_iter()
+        .find(|rule| Some(rule.id) == number);
+    match named {
+        Some(rule) => about.is_set("rule", &rule),
+        None => about.is(format!("rule {id}")),
+    }
+    let removed = match number {
+        Some(number) => app.principals.remove_rule(number)?,
+        None => false,
     };
     let rules = app.principals.rules();
     if !removed {

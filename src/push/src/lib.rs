@@ -180,17 +180,12 @@ impl Pusher {
         admitted.named(&name, report).await?;
         // Pushes of one service follow one another: whose it is does not change until this one is done.
         by.may(&name)?;
-        let is_new = self.catalogue.package(&name)?.is_none();
         let mut plan = plan_of(&built, options);
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;
         }
         let shown = self.shown(id, options, (built, plan), (name.clone(), by), report);
         let layers = left.during(shown).await?;
-        // Before anything that may fail or wait: what is published has an owner.
-        if let Some(owner) = by.owner.as_deref().filter(|_| is_new) {
-            self.catalogue.own(&name, owner)?;
-        }
         if let Some((record, _)) = &imported {
             let rows = self.take_over_rows(&name, record, report);
             left.during(rows).await?;
@@ -290,6 +285,7 @@ impl Pusher {
             image: built.image.to_string(),
             published: store::now(),
             package: built.package.clone(),
+            owner: by.owner.clone(),
             source: options.source.clone(),
             flavour: built.flavour,
             plan,

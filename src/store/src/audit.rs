@@ -69,17 +69,17 @@ fn insert(connection: &Connection, new: &NewAudited<'_>) -> rusqlite::Result<i64
 impl State {
     /// Records what somebody did, on disk when this returns; gives its number.
     pub fn add_audited(&self, new: &NewAudited<'_>) -> Result<i64, Error> {
-        self.durably(|connection| insert(connection, new))
+        self.write_durably(|connection| insert(connection, new))
     }
 
     /// The same without waiting for the disk.
     pub fn add_audited_soon(&self, new: &NewAudited<'_>) -> Result<i64, Error> {
-        self.run(|connection| insert(connection, new))
+        self.write(|connection| insert(connection, new))
     }
 
     /// The newest `limit` records after number `since`, oldest first.
     pub fn audited(&self, since: i64, limit: u32) -> Result<Vec<Audited>, Error> {
-        self.read(|connection| {
+        self.read_at_length(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, time, who, peer, action, did, object, status, more FROM

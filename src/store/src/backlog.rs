@@ -12,10 +12,10 @@ use std::time::Duration;
 
 use api::{Event, Level, Millis};
 use parking_lot::Mutex;
-use rusqlite::{Connection, ErrorCode, params};
+use rusqlite::{Connection, ErrorCode, Transaction, params};
 use tokio::sync::{Notify, watch};
 
-use super::{State, events, now, wait_for_another};
+use super::{State, commit, events, now, wait_for_another};
 
 /// Between attempts to write what is kept.
 const AGAIN: Duration = Duration::from_millis(500);
@@ -145,7 +145,7 @@ impl State {
             waiting.keep(write);
             return self.backlog.begun.notify_one();
         };
-        let outcome = impatiently(&mut connection, |connection| apply(connection, &write));
+        let outcome = impatiently(&mut connection, |transaction| apply(transaction, &write));
         drop(connection);
         let Err(error) = outcome else { return };
         waiting.keep(write);
@@ -199,7 +199,8 @@ impl State {
             return false;
         };
         while let Some(write) = waiting.writes.front() {
-            if let Err(error) = impatiently(&mut connection, |connection| apply(connection, write))
+            if let Err(error) =
+                impatiently(&mut connection, |transaction| apply(transaction, write))
             {
                 self.begin_outage(&mut waiting, &error);
                 return false;
@@ -219,8 +220,8 @@ impl State {
             now().saturating_sub(since) as f64 / 1000.0
         );
         let event = waiting.event(Level::Info, "state-writable", message);
-        if impatiently(&mut connection, |connection| {
-            events::insert(connection, &event)
+        if impatiently(&mut connection, |transaction| {
+            events::insert(transaction, &event)
         })
         .is_err()
         {
@@ -250,13 +251,13 @@ pub async fn watch(state: Arc<State>) {
     }
 }
 
-/// Runs `work` without waiting for others that have the database locked.
+/// Writes what `work` writes, all or none, without waiting for others that have the database locked.
 fn impatiently<T>(
     connection: &mut Connection,
-    work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
+    work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
 ) -> rusqlite::Result<T> {
     connection.busy_timeout(Duration::ZERO)?;
-    let outcome = work(connection);
+    let outcome = commit(connection, work);
     connection.busy_handler(Some(wait_for_another))?;
     outcome
 }

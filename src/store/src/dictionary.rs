@@ -61,8 +61,7 @@ impl State {
             let (aux, limits) = (to_json(&row.aux, service)?, to_json(&row.limits, service)?);
             texts.push((aux, limits, spread));
         }
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             if new.replace {
                 transaction.execute("DELETE FROM dictionary WHERE service = ?1", [service])?;
             }
@@ -84,13 +83,13 @@ impl State {
                     ],
                 )?;
             }
-            transaction.commit()
+            Ok(())
         })
     }
 
     /// Forgets a row of a service; false when there is none of that number.
     pub fn remove_from_dictionary(&self, service: &str, id: i64) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "DELETE FROM dictionary WHERE service = ?1 AND id = ?2",
                 params![service, id],

@@ -31,6 +31,27 @@ pub struct EventFilter<'a> {
     pub servant: Option<&'a str>,
     /// Of this robot.
     pub robot: Option<&'a str>,
+    /// Those that somebody may be told of who does not see all.
+    pub told: Option<Told<'a>>,
+}
+
+/// What somebody who does not see all is told of: events of some services, and of no robot but its own.
+#[derive(Debug, Clone, Copy)]
+pub struct Told<'a> {
+    /// These services.
+    pub services: &'a [String],
+    /// The one robot, if the reader is a robot: events of a service as such are told to all.
+    pub own_robot: Option<&'a str>,
+}
+
+impl Told<'_> {
+    fn takes(&self, event: &Event) -> bool {
+        let of_service = event.service.as_ref();
+        of_service.is_some_and(|service| self.services.contains(service))
+            && self
+                .own_robot
+                .is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
+    }
 }
 
 impl EventFilter<'_> {
@@ -40,6 +61,7 @@ impl EventFilter<'_> {
             && is(self.service, event.service.as_deref())
             && is(self.servant, event.servant.as_deref())
             && is(self.robot, event.robot.as_deref())
+            && self.told.is_none_or(|told| told.takes(event))
     }
 }
 
@@ -116,6 +138,21 @@ impl State {
         Ok(events.split_off(beyond))
     }
 
+    /// Services that there are events of, by name.
+    pub fn services_of_events(&self) -> Result<Vec<String>, Error> {
+        let mut services: Vec<String> = self.read_at_length(|connection| {
+            connection
+                .prepare_cached("SELECT DISTINCT service FROM events WHERE service IS NOT NULL")?
+                .query_map([], |row| row.get(0))?
+                .collect()
+        })?;
+        let kept = self.backlog.events(0).into_iter();
+        services.extend(kept.filter_map(|event| event.service));
+        services.sort();
+        services.dedup();
+        Ok(services)
+    }
+
     fn written_events(
         &self,
         filter: EventFilter<'_>,
@@ -127,18 +164,25 @@ impl State {
             service,
             servant,
             robot,
+            told,
         } = filter;
-        self.read(|connection| {
+        let services = told.map(|told| serde_json::Value::from(told.services).to_string());
+        let own_robot = told.and_then(|told| told.own_robot);
+        self.read_at_length(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, time, level, kind, service, servant, robot, message FROM
                      (SELECT * FROM events WHERE id > ?1
                       AND (?3 IS NULL OR kind = ?3) AND (?4 IS NULL OR service = ?4)
                       AND (?5 IS NULL OR servant = ?5) AND (?6 IS NULL OR robot = ?6)
+                      AND (?7 IS NULL OR service IN (SELECT value FROM json_each(?7)))
+                      AND (?8 IS NULL OR robot IS NULL OR robot = ?8)
                       ORDER BY id DESC LIMIT ?2) ORDER BY id",
                 )?
                 .query_map(
-                    params![since, limit, kind, service, servant, robot],
+                    params![
+                        since, limit, kind, service, servant, robot, services, own_robot
+                    ],
                     |row| {
                         Ok(Event {
                             id: row.get(0)?,
@@ -170,5 +214,77 @@ fn level_of(name: &str) -> Level {
         "info" => Level::Info,
         "warning" => Level::Warning,
         _ => Level::Error,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn about<'a>(service: Option<&'a str>, robot: Option<&'a str>) -> NewEvent<'a> {
+        NewEvent {
+            service,
+            servant: None,
+            robot,
+        }
+    }
+
+    #[test]
+    fn whoever_sees_little_is_told_the_newest_of_that_however_much_else_there_is() {
+        let home = tempfile::tempdir().expect("a directory");
+        let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
+        state.add_event(Level::Info, "k", "mine", &about(Some("mine"), Some("r1")));
+        state.add_event(Level::Info, "k", "of mine", &about(Some("mine"), None));
+        state.add_event(
+            Level::Info,
+            "k",
+            "a friend's",
+            &about(Some("mine"), Some("r2")),
+        );
+        for _ in 0..200 {
+            state.add_event(
+                Level::Info,
+                "k",
+                "theirs",
+                &about(Some("theirs"), Some("r1")),
+            );
+            state.add_event(Level::Info, "k", "the machine's", &about(None, None));
+        }
+        assert_eq!(
+            state.services_of_events().expect("readable"),
+            ["mine", "theirs"]
+        );
+        let told = |services: &[String], own_robot, limit| -> Vec<String> {
+            let filter = EventFilter {
+                told: Some(Told {
+                    services,
+                    own_robot,
+                }),
+                ..EventFilter::default()
+            };
+            let events = state.events_of(filter, 0, limit).expect("readable");
+            events.into_iter().map(|event| event.message).collect()
+        };
+        let mine = ["mine".to_owned()];
+        assert_eq!(told(&mine, None, 9), ["mine", "of mine", "a friend's"]);
+        assert_eq!(told(&mine, None, 1), ["a friend's"]);
+        assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine"]);
+        assert!(told(&[], None, 9).is_empty());
+        // Those that cannot be written yet are told alike.
+        let locker =
+            Connection::open(home.path().join("cloudroid.db")).expect("another connection");
+        locker.execute_batch("BEGIN IMMEDIATE").expect("the lock");
+        state.add_event(Level::Info, "k", "kept", &about(Some("mine"), Some("r1")));
+        state.add_event(
+            Level::Info,
+            "k",
+            "kept of others",
+            &about(Some("other"), None),
+        );
+        assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine", "kept"]);
+        assert_eq!(
+            state.services_of_events().expect("readable"),
+            ["mine", "other", "theirs"]
+        );
     }
 }

@@ -5,7 +5,7 @@ use api::Millis;
 use api::history::LocalPeriod;
 use rusqlite::{Connection, params};
 
-use super::{Error, State};
+use super::{Error, State, Told};
 
 /// Servants of which something is kept; beyond, those are forgotten that were seen first.
 const RECORDED: i64 = 20_000;
@@ -53,13 +53,14 @@ pub struct RecordedFilter<'a> {
     pub service: Option<&'a str>,
     /// Of this robot.
     pub robot: Option<&'a str>,
+    /// Those that somebody may be told of who does not see all.
+    pub told: Option<Told<'a>>,
 }
 
 impl State {
     /// Writes samples of one time and one step, in seconds, all or none.
     pub fn record(&self, step: u32, time: Millis, samples: &[NewSample<'_>]) -> Result<(), Error> {
-        self.run(|connection| {
-            let transaction = connection.transaction()?;
+        self.write(|transaction| {
             for sample in samples {
                 let id: i64 = transaction
                     .prepare_cached(
@@ -83,7 +84,7 @@ impl State {
                     )?
                     .execute(params![id, step, time as i64, figures])?;
             }
-            transaction.commit()
+            Ok(())
         })
     }
 
@@ -91,8 +92,7 @@ impl State {
     /// periods that ended before it.
     pub fn forget_history(&self, before: &[(u32, Millis)]) -> Result<(), Error> {
         let oldest = before.iter().map(|(_, time)| *time).min().unwrap_or(0) as i64;
-        self.run(|connection| {
-            let transaction = connection.transaction()?;
+        self.write(|transaction| {
             for (step, time) in before {
                 // Of each servant by its key: there is no index by time alone.
                 transaction
@@ -111,7 +111,7 @@ impl State {
                 "DELETE FROM local_periods WHERE id <= (SELECT MAX(id) FROM local_periods) - ?1",
                 [PERIODS],
             )?;
-            transaction.commit()
+            Ok(())
         })
     }
 
@@ -126,16 +126,20 @@ impl State {
             servant,
             service,
             robot,
+            told,
         } = filter;
-        self.read(|connection| {
+        let services = told.map(|told| serde_json::Value::from(told.services).to_string());
+        let own_robot = told.and_then(|told| told.own_robot);
+        self.read_at_length(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, servant, service, robot, began, seen FROM recorded
                      WHERE seen >= ?1 AND servant = COALESCE(?2, servant) AND (?2 = '' OR servant <> '')
                      AND service = COALESCE(?3, service) AND robot = COALESCE(?4, robot)
+                     AND (?6 IS NULL OR service IN (SELECT value FROM json_each(?6))) AND robot = COALESCE(?7, robot)
                      ORDER BY began DESC, id DESC LIMIT ?5",
                 )?
-                .query_map(params![from as i64, servant, service, robot, limit], |row| {
+                .query_map(params![from as i64, servant, service, robot, limit, services, own_robot], |row| {
                     Ok(RecordedLine {
                         id: row.get(0)?,
                         servant: row.get(1)?,
@@ -149,6 +153,18 @@ impl State {
         })
     }
 
+    /// Services of which there are samples, by name.
+    pub fn services_recorded(&self) -> Result<Vec<String>, Error> {
+        self.read_at_length(|connection| {
+            connection
+                .prepare_cached(
+                    "SELECT DISTINCT service FROM recorded WHERE servant <> '' ORDER BY service",
+                )?
+                .query_map([], |row| row.get(0))?
+                .collect()
+        })
+    }
+
     /// The samples of one step (seconds) with times from `from` to `to`, oldest first; at most `limit`, then the newest.
     pub fn samples(
         &self,
@@ -157,7 +173,7 @@ impl State {
         (from, to): (Millis, Millis),
         limit: usize,
     ) -> Result<Vec<(Millis, Vec<f32>)>, Error> {
-        self.read(|connection| {
+        self.read_at_length(|connection| {
             let mut found: Vec<_> = connection
                 .prepare_cached(
                     "SELECT time, figures FROM samples WHERE recorded = ?1 AND step = ?2 AND time BETWEEN ?3 AND ?4
@@ -184,7 +200,7 @@ impl State {
         began: Millis,
         why: &str,
     ) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection
                 .prepare_cached(
                     "INSERT INTO local_periods (service, robot, node, began, why) SELECT ?1, ?2, ?3, ?4, ?5
@@ -202,7 +218,7 @@ impl State {
         (service, robot, node): (&str, &str, &str),
         ended: Millis,
     ) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection
                 .prepare_cached(
                     "UPDATE local_periods SET ended = MAX(?4, began)

@@ -1,6 +1,6 @@
 //! What must survive: services, their revisions, dictionaries and rollouts, who owns a robot's name, which servant is whose,
 //! tokens, pairings, people and their sessions, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
-//! writes, and one that only reads, which no writer holds up.
+//! writes, each time in a transaction ([`State::write`]), and some that only read, which no writer holds up ([`readers`]).
 //!
 //! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
 //! perhaps the last); publishing waits for it. What only tells of the past is kept in memory while the disk is full or
@@ -16,6 +16,7 @@ mod pairings;
 mod people;
 pub mod private;
 mod provided;
+mod readers;
 mod recordings;
 mod robots;
 mod rollouts;
@@ -31,18 +32,19 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use api::Millis;
 use parking_lot::Mutex;
-use rusqlite::Connection;
+use rusqlite::{Connection, Transaction, TransactionBehavior};
 use serde::Serialize;
 
 pub use audit::NewAudited;
 use backlog::Backlog;
 pub use backlog::watch;
-pub use events::{EventFilter, NewEvent};
+pub use events::{EventFilter, NewEvent, Told};
 pub use history::{NewSample, RecordedFilter, RecordedLine};
 pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
-pub use people::{AccountRecord, NewSession, SessionRecord};
+pub use people::{AccountEdit, AccountRecord, NewSession, SessionRecord};
 pub use provided::ProvidedRecord;
+use readers::Readers;
 pub use recordings::RecordingRecord;
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
@@ -51,7 +53,7 @@ pub use services::{Plan, RevisionLine, RevisionRecord};
 pub use tokens::{NewToken, TokenRecord};
 
 /// Steps from an empty database to today's; never edited, only added to.
-const MIGRATIONS: [&str; 14] = [
+const MIGRATIONS: [&str; 15] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -66,6 +68,7 @@ const MIGRATIONS: [&str; 14] = [
     include_str!("012-history.sql"),
     include_str!("013-recordings.sql"),
     include_str!("014-recorded-topics.sql"),
+    include_str!("015-events-by-service.sql"),
 ];
 
 /// What can go wrong.
@@ -104,7 +107,7 @@ pub enum Error {
 /// The database.
 pub struct State {
     connection: Mutex<Connection>,
-    reader: Mutex<Connection>,
+    readers: Readers,
     path: String,
     backlog: Backlog,
     /// Revisions in use, by service and number.
@@ -120,6 +123,11 @@ pub fn now() -> Millis {
 pub fn millis(time: SystemTime) -> Millis {
     time.duration_since(UNIX_EPOCH)
         .map_or(0, |since| since.as_millis() as Millis)
+}
+
+/// Opens all files of a database: its first question opens the last of them, and the threads that ask later may open none.
+fn open_files(connection: &Connection) -> rusqlite::Result<()> {
+    connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
 }
 
 /// What SQLite would say.
@@ -150,29 +158,38 @@ impl State {
             .map_err(failed)?;
         migrate(&mut connection, &name)?;
         let last = events::last(&connection).map_err(failed)?;
-        let mut reader = Connection::open(path).map_err(failed)?;
-        reader
-            .busy_handler(Some(wait_for_another))
-            .map_err(failed)?;
-        reader
-            .execute_batch("PRAGMA query_only = ON; PRAGMA temp_store = MEMORY;")
-            .map_err(failed)?;
-        // The threads that ask from now on may open none of its files: the first question opens the last of them.
-        for connection in [&connection, &reader] {
-            connection
-                .query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
-                .map_err(failed)?;
-        }
+        open_files(&connection).map_err(failed)?;
         Ok(State {
             connection: Mutex::new(connection),
-            reader: Mutex::new(reader),
+            readers: Readers::open(path).map_err(failed)?,
             backlog: Backlog::new(last),
             path: name,
             revisions: Mutex::default(),
         })
     }
 
-    fn run<T>(
+    /// Writes what `work` writes, all or none: where this returns a value, no crash of the daemon loses it.
+    fn write<T>(
+        &self,
+        work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
+    ) -> Result<T, Error> {
+        self.with_writer(|connection| commit(connection, work))
+    }
+
+    /// Writes what `work` writes, all or none: where this returns a value, no cut of the power loses it.
+    fn write_durably<T>(
+        &self,
+        work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
+    ) -> Result<T, Error> {
+        self.with_writer(|connection| {
+            connection.pragma_update(None, "synchronous", "FULL")?;
+            let outcome = commit(connection, work);
+            connection.pragma_update(None, "synchronous", "NORMAL")?;
+            outcome
+        })
+    }
+
+    fn with_writer<T>(
         &self,
         work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
     ) -> Result<T, Error> {
@@ -189,9 +206,18 @@ impl State {
         })
     }
 
-    /// Runs `work`, which only reads.
+    /// Reads by `work` with a connection that no other question is using. Neither a writer nor, while a connection is
+    /// free, a longer question holds this up.
     fn read<T>(&self, work: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, Error> {
-        work(&self.reader.lock()).map_err(|source| self.failed(source))
+        work(&self.readers.take()).map_err(|source| self.failed(source))
+    }
+
+    /// Reads by `work`, which may look at thousands of rows: the tasks that share this thread go on meanwhile.
+    fn read_at_length<T>(
+        &self,
+        work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
+    ) -> Result<T, Error> {
+        aside(|| self.read(work))
     }
 
     fn failed(&self, source: rusqlite::Error) -> Error {
@@ -200,19 +226,19 @@ impl State {
             source,
         }
     }
+}
 
-    /// Runs `work` so that it is on disk when this returns.
-    fn durably<T>(
-        &self,
-        work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, Error> {
-        self.run(|connection| {
-            connection.pragma_update(None, "synchronous", "FULL")?;
-            let outcome = work(connection);
-            connection.pragma_update(None, "synchronous", "NORMAL")?;
-            outcome
-        })
-    }
+/// Runs `work` in a transaction and commits it. SQLite says only at the end of a transaction whether what was written
+/// could be (the disk may be full then), and `INSERT … RETURNING` gives its rows before that: nothing else may end one.
+fn commit<T>(
+    connection: &mut Connection,
+    work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
+) -> rusqlite::Result<T> {
+    // Immediate: a transaction that began by reading is refused, without waiting, where another wrote meanwhile.
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    let outcome = work(&transaction)?;
+    transaction.commit()?;
+    Ok(outcome)
 }
 
 /// For so long another may have the database locked before a statement fails.

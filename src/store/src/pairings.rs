@@ -81,14 +81,13 @@ impl State {
         scope: &str,
         expires: u64,
     ) -> Result<(), Error> {
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
-            cancel(&transaction, robot)?;
+        self.write_durably(|transaction| {
+            cancel(transaction, robot)?;
             transaction.execute(
                 "INSERT INTO pairing_codes (robot, hash, scope, created, expires) VALUES (?1, ?2, ?3, ?4, ?5)",
                 params![robot, hash, scope, now(), expires],
             )?;
-            transaction.commit()
+            Ok(())
         })
     }
 
@@ -116,7 +115,7 @@ impl State {
 
     /// Takes a robot's code back; false where it has none that could be used.
     pub fn cancel_pairing_code(&self, robot: &str) -> Result<bool, Error> {
-        self.durably(|connection| cancel(connection, robot))
+        self.write_durably(|connection| cancel(connection, robot))
     }
 
     /// Uses a code, if it still can be: pairs its robot with a key, in place of the one that it was paired with until now. None
@@ -127,8 +126,7 @@ impl State {
         key: &str,
         expires: u64,
     ) -> Result<Option<PairingRecord>, Error> {
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             let used = transaction
                 .prepare_cached(&format!(
                     "UPDATE pairing_codes SET used = ?2 WHERE id = ?1 AND used IS NULL AND cancelled IS NULL AND expires > ?2
@@ -137,19 +135,16 @@ impl State {
                 .query_row(params![id, now()], code)
                 .optional()?;
             let Some(used) = used else { return Ok(None) };
-            let made = replace(&transaction, &used.robot, &used.scope, Some((key, expires)))?;
-            transaction.commit()?;
+            let made = replace(transaction, &used.robot, &used.scope, Some((key, expires)))?;
             Ok(Some(made))
         })
     }
 
     /// Pairs a robot whose certificates another authority signs; a code that it has is taken back.
     pub fn add_pairing(&self, robot: &str, scope: &str) -> Result<PairingRecord, Error> {
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
-            cancel(&transaction, robot)?;
-            let made = replace(&transaction, robot, scope, None)?;
-            transaction.commit()?;
+        self.write_durably(|transaction| {
+            cancel(transaction, robot)?;
+            let made = replace(transaction, robot, scope, None)?;
             Ok(made)
         })
     }
@@ -166,7 +161,7 @@ impl State {
 
     /// Remembers the end of a pairing's newest certificate; false where it was revoked.
     pub fn pairing_renewed(&self, id: i64, expires: u64) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             let changed = connection.execute(
                 "UPDATE pairings SET expires = max(expires, ?2) WHERE id = ?1 AND revoked IS NULL",
                 params![id, expires],
@@ -177,18 +172,16 @@ impl State {
 
     /// Ends a robot's pairing, and takes back a code that it has; false where there is neither.
     pub fn revoke_pairing(&self, robot: &str) -> Result<bool, Error> {
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
-            let cancelled = cancel(&transaction, robot)?;
-            let revoked = revoke(&transaction, robot)?;
-            transaction.commit()?;
+        self.write_durably(|transaction| {
+            let cancelled = cancel(transaction, robot)?;
+            let revoked = revoke(transaction, robot)?;
             Ok(cancelled || revoked)
         })
     }
 
     /// Remembers that a robot came.
     pub fn pairing_used(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE pairings SET last_used = ?2 WHERE id = ?1",
                 params![id, at],

@@ -56,6 +56,17 @@ pub struct SessionRecord {
     pub groups: Option<String>,
 }
 
+/// A change of an account. What is none stays as it is.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct AccountEdit<'a> {
+    /// The new password's hash, in the PHC string format.
+    pub password: Option<&'a str>,
+    /// The new role, and what it is for.
+    pub role_and_scope: Option<(&'a str, &'a str)>,
+    /// Whether somebody may sign in by it.
+    pub is_disabled: Option<bool>,
+}
+
 /// A session to begin.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewSession<'a> {
@@ -134,7 +145,7 @@ impl State {
         role: &str,
         scope: &str,
     ) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "INSERT INTO accounts (name, password, role, scope, created) VALUES (?1, ?2, ?3, ?4, ?5)
                  ON CONFLICT (name) WHERE removed IS NULL DO NOTHING",
@@ -150,8 +161,7 @@ impl State {
         name: &str,
         change: impl FnOnce(&rusqlite::Transaction<'_>, i64) -> rusqlite::Result<usize>,
     ) -> Result<bool, Error> {
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             let id: Option<i64> = transaction
                 .prepare_cached("SELECT id FROM accounts WHERE name = ?1 AND removed IS NULL")?
                 .query_row([name], |row| row.get(0))
@@ -159,53 +169,41 @@ impl State {
             let Some(id) = id else {
                 return Ok(false);
             };
-            change(&transaction, id)?;
+            change(transaction, id)?;
             transaction.execute("DELETE FROM sessions WHERE account = ?1", [id])?;
-            transaction.commit()?;
             Ok(true)
         })
     }
 
-    /// Gives an account another password.
-    pub fn set_password(&self, name: &str, password: &str) -> Result<bool, Error> {
+    /// Changes what `edit` names of an account, and ends all its sessions; false where there is no such account.
+    pub fn edit_account(&self, name: &str, edit: &AccountEdit<'_>) -> Result<bool, Error> {
+        let (role, scope) = edit.role_and_scope.unzip();
+        let disabled = edit.is_disabled.map(|is_disabled| is_disabled.then(now));
         self.change_account(name, |transaction, id| {
             transaction.execute(
-                "UPDATE accounts SET password = ?2 WHERE id = ?1",
-                params![id, password],
+                "UPDATE accounts SET password = COALESCE(?2, password), role = COALESCE(?3, role),
+                 scope = COALESCE(?4, scope), disabled = CASE WHEN ?5 THEN ?6 ELSE disabled END WHERE id = ?1",
+                params![
+                    id,
+                    edit.password,
+                    role,
+                    scope,
+                    disabled.is_some(),
+                    disabled.flatten()
+                ],
             )
         })
     }
 
     /// Hashes the same password anew: sessions go on.
     pub fn rehash_password(&self, id: i64, before: &str, password: &str) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE accounts SET password = ?3 WHERE id = ?1 AND password = ?2",
                 params![id, before, password],
             )
         })
         .map(|_| ())
-    }
-
-    /// Gives an account another role and scope.
-    pub fn set_account_role(&self, name: &str, role: &str, scope: &str) -> Result<bool, Error> {
-        self.change_account(name, |transaction, id| {
-            transaction.execute(
-                "UPDATE accounts SET role = ?2, scope = ?3 WHERE id = ?1",
-                params![id, role, scope],
-            )
-        })
-    }
-
-    /// Lets nobody sign in by an account, or somebody again.
-    pub fn disable_account(&self, name: &str, disabled: bool) -> Result<bool, Error> {
-        let at = disabled.then(|| now() as i64);
-        self.change_account(name, |transaction, id| {
-            transaction.execute(
-                "UPDATE accounts SET disabled = ?2 WHERE id = ?1",
-                params![id, at],
-            )
-        })
     }
 
     /// Removes an account. That there was one is kept, its password is not.
@@ -236,8 +234,7 @@ impl State {
         password: Option<&str>,
     ) -> Result<Option<SessionRecord>, Error> {
         let at = now() as i64;
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             let good = match new.account {
                 None => true,
                 // The password may have been changed, or the account disabled, while it was hashed.
@@ -283,14 +280,13 @@ impl State {
                     params![id, at],
                 )?;
             }
-            transaction.commit()?;
             Ok(Some(made))
         })
     }
 
     /// Remembers that a session was shown.
     pub fn session_used(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE sessions SET last_used = ?2 WHERE id = ?1",
                 params![id, at],
@@ -301,13 +297,15 @@ impl State {
 
     /// Ends a session; false where there is none of that number.
     pub fn end_session(&self, id: i64) -> Result<bool, Error> {
-        self.durably(|connection| connection.execute("DELETE FROM sessions WHERE id = ?1", [id]))
-            .map(|ended| ended > 0)
+        self.write_durably(|connection| {
+            connection.execute("DELETE FROM sessions WHERE id = ?1", [id])
+        })
+        .map(|ended| ended > 0)
     }
 
     /// Ends all sessions of a person; how many there were.
     pub fn end_sessions_of(&self, name: &str) -> Result<usize, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute("DELETE FROM sessions WHERE name = ?1", [name])
         })
     }

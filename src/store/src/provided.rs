@@ -54,8 +54,7 @@ impl State {
         wanted: &str,
     ) -> Result<ProvidedRecord, Error> {
         let at = now() as i64;
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             let known = transaction
                 .prepare_cached(&format!(
                     "UPDATE provided_people SET last_login = ?3 WHERE issuer = ?1 AND subject = ?2 RETURNING {PERSON}"
@@ -83,7 +82,6 @@ impl State {
                 }
                 number += 1;
             };
-            transaction.commit()?;
             Ok(person)
         })
     }

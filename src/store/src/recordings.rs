@@ -37,7 +37,7 @@ impl State {
         let topics = topics
             .map(|topics| to_json(topics, "a recording"))
             .transpose()?;
-        self.run(|connection| {
+        self.write(|connection| {
             connection
                 .prepare_cached(
                     "INSERT INTO recordings (service, robot, servant, time, why, span, messages, bytes, topics)
@@ -63,7 +63,7 @@ impl State {
 
     /// All files, the newest first.
     pub fn recordings(&self) -> Result<Vec<RecordingRecord>, Error> {
-        self.read(|connection| {
+        self.read_at_length(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, service, robot, servant, time, why, span, messages, bytes, topics
@@ -76,7 +76,7 @@ impl State {
 
     /// Forgets a file; whether it was known.
     pub fn forget_recording(&self, id: u64) -> Result<bool, Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute("DELETE FROM recordings WHERE id = ?1", [id as i64])
         })
         .map(|forgotten| forgotten > 0)
@@ -126,7 +126,7 @@ mod tests {
         assert_eq!(state.recordings().expect("read"), [record.clone()]);
         // Of files of before nobody knows what they hold.
         let of_before = "UPDATE recordings SET topics = NULL";
-        let changed = state.run(|connection| connection.execute(of_before, []));
+        let changed = state.write(|connection| connection.execute(of_before, []));
         assert_eq!(changed.expect("written"), 1);
         record.topics = None;
         assert_eq!(state.recordings().expect("read"), [record.clone()]);

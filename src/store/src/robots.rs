@@ -33,7 +33,7 @@ impl State {
             self.robot_seen(robot);
             return Ok(known);
         }
-        self.run(|connection| {
+        self.write(|connection| {
             connection
                 .prepare_cached(
                     "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
@@ -46,7 +46,7 @@ impl State {
 
     /// Binds a robot's name to `owner`, whoever had it before.
     pub fn bind_robot(&self, robot: &str, owner: &Owner) -> Result<(), Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "INSERT INTO robots (name, owner, first_seen, last_seen) VALUES (?1, ?2, ?3, ?3)
                  ON CONFLICT (name) DO UPDATE SET owner = ?2",
@@ -59,7 +59,7 @@ impl State {
     /// Forgets robots bound to owners that are not in `owners` any more, so that their names can be used again.
     pub fn release_robots(&self, owners: &[Owner]) -> Result<usize, Error> {
         let kept = serde_json::Value::from(owners).to_string();
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "DELETE FROM robots WHERE owner IS NOT NULL AND owner NOT IN (SELECT value FROM json_each(?1))",
                 [kept],

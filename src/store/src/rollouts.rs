@@ -7,7 +7,7 @@ use super::{Error, State};
 impl State {
     /// Remembers a service's rollout in place of an earlier one.
     pub fn set_rollout(&self, service: &str, rollout: &str) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             // A service that was removed meanwhile has none.
             connection.execute(
                 "INSERT OR REPLACE INTO rollouts (service, rollout)

@@ -39,7 +39,7 @@ impl State {
 
     /// Records a rule, on disk when this returns.
     pub fn add_rule(&self, who: &str, services: &str, allow: &str) -> Result<RuleRecord, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection
                 .prepare_cached(
                     "INSERT INTO rules (who, services, allow) VALUES (?1, ?2, ?3) RETURNING id, who, services, allow",
@@ -50,7 +50,7 @@ impl State {
 
     /// Forgets a rule; none where there is none of that number.
     pub fn remove_rule(&self, id: i64) -> Result<Option<RuleRecord>, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection
                 .prepare_cached(
                     "DELETE FROM rules WHERE id = ?1 RETURNING id, who, services, allow",

@@ -32,7 +32,7 @@ impl State {
     pub fn add_servant(&self, servant: &ServantRecord) -> Result<(), Error> {
         let terms = servant.terms.as_ref();
         let terms = terms.map(|terms| to_json(terms, &servant.id)).transpose()?;
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "INSERT OR REPLACE INTO servants (id, service, revision, robot, anonymous, created, terms)
                  VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)",
@@ -53,7 +53,7 @@ impl State {
     /// Remembers the limits that a servant was given while it lived.
     pub fn set_servant_limits(&self, id: &str, limits: &Limits) -> Result<(), Error> {
         let limits = to_json(limits, id)?;
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE servants SET limits = ?2 WHERE id = ?1",
                 [id, limits.as_str()],
@@ -65,7 +65,7 @@ impl State {
     /// Remembers what the robot of a servant states now, and what follows.
     pub fn set_servant_terms(&self, id: &str, terms: &Terms) -> Result<(), Error> {
         let terms = to_json(terms, id)?;
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE servants SET terms = ?2 WHERE id = ?1",
                 [id, terms.as_str()],

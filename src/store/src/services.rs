@@ -22,8 +22,10 @@ pub struct RevisionRecord {
     pub image: String,
     /// When it was published.
     pub published: Millis,
-    /// The ROS package.
+    /// The ROS package that the service was first made of.
     pub package: String,
+    /// The deployer who published the service first: none, where an operator did.
+    pub owner: Option<String>,
     /// What was pushed, in words.
     pub source: String,
     /// The ROS that its image is built for.
@@ -87,8 +89,8 @@ pub struct Plan {
 }
 
 impl State {
-    /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns. `inventory`:
-    /// what its image holds.
+    /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns. Package and owner
+    /// are those of a service that is new: one that exists keeps its own. `inventory`: what its image holds.
     pub fn publish(&self, revision: &RevisionRecord, inventory: &Inventory) -> Result<u64, Error> {
         self.publish_as(revision, inventory, true)
     }
@@ -112,8 +114,7 @@ impl State {
         let inventory = to_json(inventory, &revision.service)?;
         let plan = to_json(&revision.plan, &revision.service)?;
         let interface = to_json(&revision.interface, &revision.service)?;
-        self.durably(|connection| {
-            let transaction = connection.transaction()?;
+        self.write_durably(|transaction| {
             // Numbers are never given twice, not even after the service was removed and pushed again.
             let number: u64 = transaction.query_row(
                 "INSERT INTO numbers (service, last) VALUES (?1, 1)
@@ -122,9 +123,15 @@ impl State {
                 |row| row.get(0),
             )?;
             transaction.execute(
-                "INSERT INTO services (name, package, current) VALUES (?1, ?2, ?3)
+                "INSERT INTO services (name, package, current, owner) VALUES (?1, ?2, ?3, ?5)
                  ON CONFLICT (name) DO UPDATE SET current = CASE WHEN ?4 THEN ?3 ELSE current END",
-                params![revision.service, revision.package, number, current],
+                params![
+                    revision.service,
+                    revision.package,
+                    number,
+                    current,
+                    revision.owner
+                ],
             )?;
             transaction.execute(
                 "INSERT INTO revisions
@@ -142,14 +149,13 @@ impl State {
                     inventory
                 ],
             )?;
-            transaction.commit()?;
             Ok(number)
         })
     }
 
     /// Makes an earlier (or later) revision the current one; false when there is none of that number.
     pub fn set_current(&self, service: &str, number: u64) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?2 WHERE name = ?1
                  AND EXISTS (SELECT 1 FROM revisions WHERE service = ?1 AND number = ?2)",
@@ -161,7 +167,7 @@ impl State {
 
     /// Makes revision `to` the current one where `from` is it, or `to` itself; false where another one is.
     pub fn replace_current(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?3 WHERE name = ?1 AND current IN (?2, ?3)
                  AND EXISTS (SELECT 1 FROM revisions WHERE service = ?1 AND number = ?3)",
@@ -173,7 +179,7 @@ impl State {
 
     /// Forgets a service and its revisions; false when there is none.
     pub fn remove_service(&self, name: &str) -> Result<bool, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute("DELETE FROM services WHERE name = ?1", [name])
         })
         .map(|changed| changed == 1)
@@ -210,17 +216,6 @@ impl State {
                 .query_row([name], |row| row.get(0))
                 .optional()
         })
-    }
-
-    /// Records whose a service is that nobody owns yet; on disk when this returns.
-    pub fn own_service(&self, name: &str, owner: &str) -> Result<(), Error> {
-        self.durably(|connection| {
-            connection.execute(
-                "UPDATE services SET owner = ?2 WHERE name = ?1 AND owner IS NULL",
-                [name, owner],
-            )
-        })
-        .map(|_| ())
     }
 
     /// The current revision of a service.
@@ -270,6 +265,7 @@ impl State {
                 image: row.get(0)?,
                 published: row.get::<_, i64>(1)? as Millis,
                 package: row.get(2)?,
+                owner: row.get(7)?,
                 source: row.get(3)?,
                 flavour: Flavour::default(),
                 plan: Plan::default(),
@@ -280,7 +276,7 @@ impl State {
         let found = self.read(|connection| {
             connection
                 .prepare_cached(
-                    "SELECT r.image, r.published, s.package, r.source, r.plan, r.interface, r.flavour
+                    "SELECT r.image, r.published, s.package, r.source, r.plan, r.interface, r.flavour, s.owner
                      FROM revisions r JOIN services s ON s.name = r.service
                      WHERE r.service = ?1 AND r.number = ?2",
                 )?
@@ -329,7 +325,7 @@ impl State {
         inventory: &Inventory,
     ) -> Result<(), Error> {
         let (flavour, inventory) = (to_json(flavour, service)?, to_json(inventory, service)?);
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection.execute(
                 "UPDATE revisions SET flavour = ?3, inventory = ?4 WHERE service = ?1 AND number = ?2",
                 params![service, number, flavour, inventory],

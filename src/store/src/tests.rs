@@ -12,6 +12,7 @@ fn revision(service: &str, image: &str) -> RevisionRecord {
         image: image.into(),
         published: now(),
         package: "opencv_apps".into(),
+        owner: None,
         source: "--apt opencv_apps".into(),
         flavour: Default::default(),
         plan: Plan {
@@ -296,6 +297,7 @@ fn events_are_told_apart_by_kind_and_by_whom_they_are_about() {
         service,
         servant,
         robot,
+        told: None,
     };
     for (filter, expected) in [
         (all, &["0", "1", "2", "3", "4"][..]),
@@ -513,16 +515,23 @@ fn a_new_database_grants_robots_and_deployers_what_they_had() {
 fn a_service_is_owned_by_whoever_published_it_first() {
     let (_directory, state) = state();
     assert_eq!(state.service_owner("a").expect("readable"), None);
-    state
-        .publish(&revision("a", "sha256:1"), &Inventory::default())
-        .expect("published");
-    assert_eq!(state.service_owner("a").expect("readable"), Some(None));
-    state.own_service("a", "alice").expect("written");
-    state.own_service("a", "bob").expect("written");
-    assert_eq!(
-        state.service_owner("a").expect("readable"),
-        Some(Some("alice".into()))
-    );
+    let published = |service: &str, owner: Option<&str>| {
+        let mut record = revision(service, "sha256:1");
+        record.owner = owner.map(str::to_owned);
+        let number = state.publish(&record, &Inventory::default());
+        let revision = state.revision(service, number.expect("published"));
+        let owner = revision.expect("readable").expect("there").owner.clone();
+        assert_eq!(
+            state.service_owner(service).expect("readable"),
+            Some(owner.clone())
+        );
+        owner
+    };
+    let alice = Some("alice".to_owned());
+    assert_eq!(published("a", Some("alice")), alice);
+    assert_eq!(published("a", Some("bob")), alice);
+    assert_eq!(published("b", None), None);
+    assert_eq!(published("b", Some("bob")), None, "it is the operator's");
 }
 
 #[test]

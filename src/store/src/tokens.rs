@@ -71,7 +71,7 @@ impl State {
 
     /// Records a token, on disk when this returns; none where its name is another token's, that was not revoked.
     pub fn add_token(&self, new: &NewToken<'_>) -> Result<Option<TokenRecord>, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection
                 .prepare_cached(&format!(
                     "INSERT INTO tokens (name, hash, role, scope, created, expires) VALUES (?1, ?2, ?3, ?4, ?5, ?6)
@@ -87,7 +87,7 @@ impl State {
 
     /// Gives the token of that name another secret; none where there is no such token, or it was revoked.
     pub fn rotate_token(&self, name: &str, hash: &str) -> Result<Option<TokenRecord>, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection
                 .prepare_cached(&format!(
                     "UPDATE tokens SET hash = ?2 WHERE name = ?1 AND revoked IS NULL RETURNING {COLUMNS}"
@@ -99,7 +99,7 @@ impl State {
 
     /// Ends the token of that name; none where there is no such token, or it was revoked before.
     pub fn revoke_token(&self, name: &str) -> Result<Option<TokenRecord>, Error> {
-        self.durably(|connection| {
+        self.write_durably(|connection| {
             connection
                 .prepare_cached(&format!(
                     "UPDATE tokens SET revoked = ?2 WHERE name = ?1 AND revoked IS NULL RETURNING {COLUMNS}"
@@ -111,7 +111,7 @@ impl State {
 
     /// Remembers that a token was shown.
     pub fn token_used(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.run(|connection| {
+        self.write(|connection| {
             connection.execute(
                 "UPDATE tokens SET last_used = ?2 WHERE id = ?1",
                 params![id, at],

@@ -8,7 +8,7 @@ use access::{Glob, Principal, Role};
 use api::Millis;
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 use catalogue::names;
-use store::{AccountRecord, NewSession, Owner, SessionRecord};
+use store::{AccountEdit, AccountRecord, NewSession, Owner, SessionRecord};
 
 use super::changing::{RESERVED, SECRET};
 use super::stored::{StoredScope, damaged, read_principal};
@@ -367,21 +367,23 @@ impl Principals {
         if let Some(role) = change.role {
             check_role(role, &change.services).map_err(Error::BadRequest)?;
         }
-        let mut known = true;
-        if let Some(password) = password {
-            known &= self.state.set_password(name, password)?;
-        }
-        if let Some(role) = change.role {
-            let scope = scope(&change.services, name)?;
-            known &= self.state.set_account_role(name, role.name(), &scope)?;
-        }
-        if let Some(disabled) = change.disabled {
-            known &= self.state.disable_account(name, disabled)?;
-        }
+        let scope = change
+            .role
+            .map(|_| scope(&change.services, name))
+            .transpose()?;
+        let is_known = self.state.edit_account(
+            name,
+            &AccountEdit {
+                password,
+                role_and_scope: change.role.map(Role::name).zip(scope.as_deref()),
+                is_disabled: change.disabled,
+            },
+        )?;
         self.reload()?;
-        match known {
-            true => Ok(()),
-            false => Err(self.unknown_account(name)),
+        if is_known {
+            Ok(())
+        } else {
+            Err(self.unknown_account(name))
         }
     }
 

@@ -34,7 +34,11 @@ fn a_name_is_one_live_accounts() {
     );
     assert!(state.remove_account("alice").expect("removed"));
     assert!(!state.remove_account("alice").expect("none is left"));
-    assert!(!state.set_password("alice", "hash").expect("none is left"));
+    let edit = AccountEdit {
+        password: Some("hash"),
+        ..AccountEdit::default()
+    };
+    assert!(!state.edit_account("alice", &edit).expect("none is left"));
     assert!(
         state
             .add_account("alice", "other", "admin", "{}")
@@ -67,9 +71,13 @@ fn a_session_begins_by_an_account_as_it_is_and_those_that_are_over_go() {
         std::slice::from_ref(&made)
     );
     assert!(state.accounts().expect("readable")[0].last_login.is_some());
-    state
-        .set_account_role("alice", "admin", "{}")
-        .expect("written");
+    let edit = AccountEdit {
+        role_and_scope: Some(("admin", "{}")),
+        ..AccountEdit::default()
+    };
+    assert!(state.edit_account("alice", &edit).expect("written"));
+    let account = &state.accounts().expect("readable")[0];
+    assert_eq!((&*account.role, &*account.password), ("admin", "hash"));
     assert_eq!(state.sessions().expect("readable"), []);
     assert!(!state.end_session(made.id).expect("over"));
 }

@@ -1,0 +1,61 @@
+//! A disk that a story can fill: a file system in memory, below the place of this run.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use nix::mount::{MntFlags, MsFlags, mount, umount2};
+
+use crate::world::{Directory, world};
+
+/// It is unmounted when it is dropped.
+pub struct SmallDisk {
+    directory: Directory,
+}
+
+impl SmallDisk {
+    /// A disk of `size`, such as `64M`, in a directory of that name.
+    pub fn mount(name: &str, size: &str) -> anyhow::Result<SmallDisk> {
+        let directory = world().directory(name)?;
+        let options = format!("size={size}");
+        mount(
+            Some("tmpfs"),
+            directory.path(),
+            Some("tmpfs"),
+            MsFlags::empty(),
+            Some(&*options),
+        )?;
+        Ok(SmallDisk { directory })
+    }
+
+    /// A home on it for a daemon.
+    pub fn home(&self) -> PathBuf {
+        self.path().join("home")
+    }
+
+    /// Writes until nothing more fits.
+    pub fn fill(&self) -> anyhow::Result<()> {
+        let mut filler = File::create(self.filler())?;
+        // It ends by an error: the disk is full.
+        let _ = std::io::copy(&mut std::io::repeat(1), &mut filler);
+        Ok(())
+    }
+
+    /// Removes what filled it.
+    pub fn make_room(&self) -> anyhow::Result<()> {
+        Ok(std::fs::remove_file(self.filler())?)
+    }
+
+    fn filler(&self) -> PathBuf {
+        self.path().join("filler")
+    }
+
+    fn path(&self) -> &Path {
+        self.directory.path()
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = umount2(self.path(), MntFlags::MNT_DETACH);
+    }
+}
