@@ -29,6 +29,8 @@ pub(super) type Answer<T> = Result<Json<T>, Error>;
 
 /// Lines of a log when nobody says how many.
 const LOG_LINES: usize = 10_000;
+/// Bytes that a line of a log takes beside its text, about.
+const LOG_LINE: usize = 150;
 
 /// `/healthz`.
 pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
@@ -437,14 +439,26 @@ pub async fn logs(
         return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
     };
     let count = part.tail.unwrap_or(LOG_LINES);
+    // Whoever reads slowly keeps files open and lines in memory for as long.
+    let place = app.live.place(&caller)?;
     if part.follow {
         let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
+        let printed = printed.map(move |line| {
+            let _held = &place;
+            views::log_line(line)
+        });
         // A follower must not keep the daemon from ending.
         let ending = caller.over(&app, handle.service());
-        return Ok(lines(printed.map(views::log_line).take_until(ending)));
+        return Ok(lines(printed.take_until(ending)));
     }
     let past = container.logs(count, None).await;
-    Ok(lines(futures_util::stream::iter(past).map(views::log_line)))
+    let budget = app.choreographer.memory().client(&caller.peer.client(None));
+    let held = budget.take(past.iter().map(|line| line.line.len() + LOG_LINE).sum())?;
+    let past = futures_util::stream::iter(past).map(move |line| {
+        let _held = (&place, &held);
+        views::log_line(line)
+    });
+    Ok(lines(past))
 }
 
 /// A stream of values as JSON lines.

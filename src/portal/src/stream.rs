@@ -32,7 +32,7 @@ use crate::guard::Caller;
 use listener::Listener;
 use sampler::Sample;
 
-/// Streams of one principal from one client: pages that are open beside each other.
+/// Streams of one principal from one client: pages that are open beside each other, logs and events that are followed.
 const MOST: usize = 32;
 /// A comment this often tells proxies and pages that the connection is there.
 const ALIVE: Duration = Duration::from_secs(15);

@@ -18,6 +18,7 @@ use crate::container::{ContainerSpec, Profile};
 use crate::engine::{Adopted, Ended, Engine, Servant};
 use crate::launch::{self, Exit, Runtime};
 pub use crate::launch::{Grace, Isolation};
+use crate::logs::Watches;
 use crate::quotas::Quotas;
 use crate::spec::{Limits, Spec};
 
@@ -132,6 +133,8 @@ struct Shared {
     config: LocalEngineConfig,
     parent: Parent,
     networks: pool::Networks,
+    /// Of directories in which logs are followed.
+    watches: Arc<Watches>,
     /// Those that somebody holds, by id.
     servants: Mutex<HashMap<String, Weak<LocalServant>>>,
 }
@@ -171,6 +174,7 @@ impl LocalEngine {
                 config,
                 parent,
                 networks,
+                watches: Arc::default(),
                 servants: Mutex::default(),
             }),
             resources: Arc::new(NoResources),
@@ -272,7 +276,12 @@ impl LocalEngine {
         else {
             return Ok(None);
         };
-        match handle::adopt(id, directory, &runtime, pidfd).await {
+        let place = handle::Place {
+            id,
+            directory,
+            watches: &self.shared.watches,
+        };
+        match handle::adopt(place, &runtime, pidfd).await {
             Ok(servant) => {
                 self.shared.keep(&servant);
                 Ok(Some(servant))

@@ -14,9 +14,11 @@ use crate::quotas::Rate;
 
 mod follow;
 mod tail;
+mod watches;
 
-pub use follow::{follow, with_past};
+pub use follow::follow;
 pub use tail::last;
+pub use watches::Watches;
 
 /// The file's name in the servant's directory.
 pub const FILE: &str = "log.jsonl";

@@ -24,11 +24,12 @@ use crate::engine::{
 };
 use crate::launch::{self, Exit, Launch, Runtime};
 use crate::local::Grace;
+use crate::logs::{self, Watches};
 use crate::netns::NetNs;
 use crate::process::{self, Identity};
 use crate::protocol::Command;
 use crate::spec::{Limits, NodeSpec};
-use crate::{logs, sys};
+use crate::sys;
 
 /// Beyond the grace time, for a shim to finish what it does at the end.
 const FINISH: Duration = Duration::from_secs(20);
@@ -48,6 +49,8 @@ pub struct LocalServant {
     requests: Requests,
     known: Arc<Known>,
     listener: JoinHandle<()>,
+    /// What tells followers of the log that it has changed.
+    watches: Arc<Watches>,
     /// Followers of the log that may still have a file to open.
     followers: watch::Sender<()>,
 }
@@ -58,17 +61,26 @@ impl Drop for LocalServant {
     }
 }
 
+/// Where a servant lives.
+#[derive(Clone, Copy)]
+pub(super) struct Place<'a> {
+    pub id: &'a str,
+    pub directory: &'a Path,
+    /// What tells of changes in directories of servants.
+    pub watches: &'a Arc<Watches>,
+}
+
 /// Waits for a shim just started to say that its container runs.
 pub(super) async fn started(
     launch: &Launch,
-    directory: &Path,
+    place: Place<'_>,
     network: NetNs,
     control: StdStream,
     shim: Identity,
 ) -> Result<Arc<LocalServant>, Error> {
-    let id = &launch.spec.id;
+    let Place { id, directory, .. } = place;
     let ended = || Error::Start {
-        id: id.clone(),
+        id: id.to_owned(),
         reason: last_words(directory),
     };
     let pidfd = shim
@@ -81,15 +93,8 @@ pub(super) async fn started(
         shim_cgroup: Some(Cgroup::of_shim(&launch.parent, &launch.spec.id)),
         uid_range: launch.uid_range,
     };
-    let servant = connect(
-        id,
-        directory,
-        network,
-        control,
-        &runtime,
-        pidfd,
-        launch.grace,
-    )?;
+    let grace = launch.grace;
+    let servant = connect(place, network, control, &runtime, pidfd, grace)?;
     let mut state = servant.known.state.subscribe();
     let mut closed = servant.known.closed.subscribe();
     tokio::select! {
@@ -103,7 +108,7 @@ pub(super) async fn started(
         ContainerState::Creating => Err(ended()),
         ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
             Err(Error::Start {
-                id: id.clone(),
+                id: id.to_owned(),
                 reason,
             })
         }
@@ -112,11 +117,11 @@ pub(super) async fn started(
 
 /// Connects to the shim that an earlier daemon left.
 pub(super) async fn adopt(
-    id: &str,
-    directory: &Path,
+    place: Place<'_>,
     runtime: &Runtime,
     pidfd: OwnedFd,
 ) -> Result<Arc<LocalServant>, Error> {
+    let Place { id, directory, .. } = place;
     let path = directory.join(launch::SPEC);
     let missing = || Error::Malformed {
         path: path.clone(),
@@ -130,15 +135,8 @@ pub(super) async fn adopt(
         .map_err(Error::file("connect to", directory.join(launch::SOCKET)))?;
     // The pid is that of the process held by its pidfd.
     let network = NetNs::from_pid(runtime.shim.pid)?;
-    let servant = connect(
-        id,
-        directory,
-        network,
-        control,
-        runtime,
-        pidfd,
-        launch.grace,
-    )?;
+    let grace = launch.grace;
+    let servant = connect(place, network, control, runtime, pidfd, grace)?;
     let mut state = servant.known.state.subscribe();
     let mut closed = servant.known.closed.subscribe();
     let silent = || Error::Ended {
@@ -158,8 +156,7 @@ pub(super) async fn adopt(
 }
 
 fn connect(
-    id: &str,
-    directory: &Path,
+    place: Place<'_>,
     network: NetNs,
     control: StdStream,
     runtime: &Runtime,
@@ -171,6 +168,7 @@ fn connect(
         .map_err(Error::call("talking to a shim"))?;
     let stream = UnixStream::from_std(control).map_err(Error::call("talking to a shim"))?;
     let (read, requests) = Requests::split(stream);
+    let Place { id, directory, .. } = place;
     let known = Arc::new(Known::default());
     let shim = Arc::new(pidfd);
     let listener = tokio::spawn(watch_over(
@@ -190,6 +188,7 @@ fn connect(
         requests,
         known,
         listener,
+        watches: Arc::clone(place.watches),
         followers: watch::Sender::new(()),
     }))
 }
@@ -484,19 +483,8 @@ impl Servant for LocalServant {
 
     fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine> {
         let path = self.log_path();
-        // Following begins before the past is read, so that no line falls between.
-        let lines = logs::follow(
-            path.clone(),
-            from == LogStart::First,
-            ended(self.state()),
-            self.followers.subscribe(),
-        );
-        match from {
-            LogStart::Last(count) => {
-                logs::with_past(path, count, lines, self.followers.subscribe())
-            }
-            LogStart::First | LogStart::Now => lines,
-        }
+        let guard = self.followers.subscribe();
+        logs::follow(&self.watches, path, from, ended(self.state()), guard)
     }
 
     async fn stop(&self) -> Result<(), Error> {

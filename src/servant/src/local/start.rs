@@ -64,7 +64,12 @@ async fn start_in(
     hand_over(&control, &network, &lock, &launch.spec.mounts)?;
     // The shim holds the lock from here on.
     drop(lock);
-    handle::started(&launch, directory, network, control, shim).await
+    let place = handle::Place {
+        id: &launch.spec.id,
+        directory,
+        watches: &shared.watches,
+    };
+    handle::started(&launch, place, network, control, shim).await
 }
 
 /// Starts the shim with our socket as its standard input. No descriptor is prepared between fork and exec, so that the

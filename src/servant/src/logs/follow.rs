@@ -1,46 +1,53 @@
 //! Reading a log while it is written and rotated.
 //!
 //! Two tasks: one opens each file as soon as it is there and never waits for anybody; the other reads them in order, as
-//! slowly as its receiver likes. So neither a rotation nor the removal of the log can take away what was not read yet.
+//! slowly as its receiver likes. So neither a rotation nor the removal of the log takes away at once what was not read yet. Who is slower
+//! than two rotations goes on with the newest and is told how many lines are missing, since files that are removed and open take the disk.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::os::fd::{AsFd, AsRawFd, RawFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
-use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
-use tokio::io::Interest;
-use tokio::io::unix::AsyncFd;
-use tokio::sync::mpsc::error::TryRecvError;
 use tokio::sync::{mpsc, watch};
 
-use super::{last, rotated};
-use crate::engine::LogLine;
+use super::rotated;
+use super::tail::seek_to_last;
+use super::watches::{Watch, Watches};
+use crate::engine::{LogLine, LogStart};
 
 /// Lines that may wait for the receiver.
-const AHEAD: usize = 256;
+const AHEAD: usize = 16;
+/// Files that may wait to be read: as many as there are of a log.
+const UNREAD: usize = 2;
 /// Bytes read at once.
 const BLOCK: usize = 64 * 1024;
 
-/// Every line of the log at `path`, from the first that is still there or from now on. It ends, after the last line, when
+/// Lines of the log at `path`, from `start` on. They end, after the last line, when
 /// `ended` completes: that must not be before the last line was written. From when `guard` is dropped on, the log may be removed.
 pub fn follow(
+    watches: &Arc<Watches>,
     path: PathBuf,
-    from_start: bool,
+    start: LogStart,
     ended: impl Future<Output = ()> + Send + 'static,
     guard: impl Send + 'static,
 ) -> mpsc::Receiver<LogLine> {
     let (sender, receiver) = mpsc::channel(AHEAD);
-    let (files, opened) = mpsc::unbounded_channel();
+    let opened = Arc::new(Opened::default());
     let changes = watch::Sender::new(());
     let changed = changes.subscribe();
     // Opened here and not in the task: what is written after this function has returned is surely seen. Files are opened
     // where that may be, and what servants printed is parsed elsewhere.
     let log = path.clone();
+    let watches = Arc::clone(watches);
+    let files = Arc::clone(&opened);
     let discovering = privilege::now(move || {
-        let discovery = Discovery::open(&log, from_start, files)?;
+        let directory = log.parent().unwrap_or(Path::new("/"));
+        let watch = watches.watch(directory)?;
+        let discovery = Discovery::open(&log, start, watch, files)?;
         tokio::spawn(async move {
             discovery.run(&changes, ended).await;
             drop(guard);
@@ -48,7 +55,16 @@ pub fn follow(
         Ok::<_, io::Error>(())
     });
     match discovering {
-        Ok(()) => drop(tokio::spawn(read(opened, changed, sender))),
+        Ok(()) => {
+            let reader = Reader {
+                file: None,
+                younger: None,
+                opened,
+                changed,
+                sender,
+            };
+            tokio::spawn(reader.run(start));
+        }
         Err(error) => {
             // The channel is empty: there is room for the one line.
             let _ = sender.try_send(note(format!(
@@ -60,76 +76,59 @@ pub fn follow(
     receiver
 }
 
-/// `lines` of the log at `path`, which are followed from now on, behind its last `count` lines until now; none comes twice.
-/// From when `guard` is dropped on, the log may be removed.
-pub fn with_past(
-    path: PathBuf,
-    count: usize,
-    mut lines: mpsc::Receiver<LogLine>,
-    guard: impl Send + 'static,
-) -> mpsc::Receiver<LogLine> {
-    let (sender, receiver) = mpsc::channel(AHEAD);
-    tokio::spawn(async move {
-        let past = last(path, count, None).await;
-        drop(guard);
-        let newest = past.last().and_then(|line| line.number);
-        for line in past {
-            if sender.send(line).await.is_err() {
-                return;
-            }
-        }
-        loop {
-            let line = tokio::select! {
-                line = lines.recv() => line,
-                () = sender.closed() => return,
-            };
-            let Some(line) = line else { return };
-            if is_after(&line, newest) && sender.send(line).await.is_err() {
-                return;
-            }
-        }
-    });
-    receiver
+/// Files that are known and not read yet, the newest few of them.
+#[derive(Default)]
+struct Opened(Mutex<Queue>);
+
+#[derive(Default)]
+struct Queue {
+    files: VecDeque<File>,
+    /// Whether one was left out since one was taken.
+    has_skipped: bool,
 }
 
-/// Whether a line comes after the one with the number `newest`. Its time says nothing: clocks are set back.
-fn is_after(line: &LogLine, newest: Option<u64>) -> bool {
-    line.number.is_none() || line.number > newest
-}
+impl Opened {
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 
-/// What nix lacks: its inotify has no raw descriptor to show.
-struct Watch(Inotify);
+    fn add(&self, file: File) {
+        let mut queue = self.queue();
+        if queue.files.len() >= UNREAD {
+            queue.files.pop_front();
+            queue.has_skipped = true;
+        }
+        queue.files.push_back(file);
+    }
 
-impl AsRawFd for Watch {
-    fn as_raw_fd(&self) -> RawFd {
-        self.0.as_fd().as_raw_fd()
+    fn take(&self) -> Option<File> {
+        let mut queue = self.queue();
+        queue.has_skipped = false;
+        queue.files.pop_front()
+    }
+
+    fn has_skipped(&self) -> bool {
+        self.queue().has_skipped
     }
 }
 
 struct Discovery {
     path: PathBuf,
-    watch: AsyncFd<Watch>,
-    files: mpsc::UnboundedSender<File>,
+    watch: Watch,
+    files: Arc<Opened>,
     /// The youngest file that is known. Held open, so that its inode cannot become another file's.
     last: Option<File>,
 }
 
 impl Discovery {
-    fn open(path: &Path, from_start: bool, files: mpsc::UnboundedSender<File>) -> io::Result<Self> {
-        let inotify = Inotify::init(InitFlags::IN_CLOEXEC | InitFlags::IN_NONBLOCK)?;
-        let directory = path.parent().unwrap_or(Path::new("/"));
-        let events =
-            AddWatchFlags::IN_MODIFY | AddWatchFlags::IN_CREATE | AddWatchFlags::IN_ONLYDIR;
-        inotify.add_watch(directory, events)?;
-        // SAFETY: the descriptor is owned by what is registered, and nothing else closes it.
-        let watch = unsafe { AsyncFd::register_with_interest(Watch(inotify), Interest::READABLE) }?;
+    fn open(path: &Path, start: LogStart, watch: Watch, files: Arc<Opened>) -> io::Result<Self> {
         let mut discovery = Self {
             path: path.into(),
             watch,
             files,
             last: None,
         };
-        if from_start {
+        if start != LogStart::Now {
             discovery.look()?;
         } else if let Some(mut file) = existing(path)? {
             file.seek(SeekFrom::End(0))?;
@@ -142,15 +141,11 @@ impl Discovery {
         let mut ended = std::pin::pin!(ended);
         loop {
             let over = tokio::select! {
-                _ = self.watch.readable() => false,
+                () = self.watch.changed() => false,
                 () = &mut ended => true,
                 () = changes.closed() => return,
             };
-            // What happened is looked up in the directory; the events only say when. Read until there are no more, or the
-            // next wait would return at once.
-            let read = |watch: &Watch| watch.0.read_events().map_err(io::Error::from);
-            while self.watch.try_io(Interest::READABLE, read).is_ok() {}
-            // A failure to open shows as a gap in the numbers.
+            // What happened is looked up in the directory; the watch only says when. A failure to open shows as a gap in the numbers.
             let _ = self.look();
             if over {
                 return;
@@ -186,55 +181,91 @@ impl Discovery {
 
     fn pass_on(&mut self, file: File) -> io::Result<()> {
         self.last = Some(file.try_clone()?);
-        // Nobody reads any more: run ends by itself.
-        let _ = self.files.send(file);
+        self.files.add(file);
         Ok(())
     }
 }
 
-/// Reads the files in their order.
-async fn read(
-    mut opened: mpsc::UnboundedReceiver<File>,
-    mut changed: watch::Receiver<()>,
+/// Reads the files in their order. Where its receiver is too slow for that, it goes on with the newest.
+struct Reader {
+    /// What is read.
+    file: Option<File>,
+    /// What is read next.
+    younger: Option<File>,
+    opened: Arc<Opened>,
+    changed: watch::Receiver<()>,
     sender: mpsc::Sender<LogLine>,
-) {
-    let Some(mut file) = opened.recv().await else {
-        return;
-    };
-    let mut next = None;
-    let mut complete = false;
-    let mut cutter = Cutter::default();
-    loop {
-        changed.mark_unchanged();
-        let lines = match cutter.read(&mut file) {
-            Ok(lines) => lines,
-            Err(error) => vec![note(format!("the log could not be read on: {error}"))],
-        };
-        let Some(lines) = (!lines.is_empty()).then_some(lines) else {
-            // The end, for now. Nothing more is written to a file once a younger one is known, nor once the log is complete:
-            // but that must have been known before the last read.
-            if let Some(younger) = next.take() {
-                file = younger;
+}
+
+impl Reader {
+    /// Comes back when the log was read to its end, or nobody receives any more.
+    async fn run(mut self, start: LogStart) {
+        if let LogStart::Last(count) = start {
+            // The older one comes first, if there is one.
+            let files = self.opened.take().into_iter().chain(self.opened.take());
+            let files = files.collect();
+            let placed = tokio::task::spawn_blocking(move || seek_to_last(files, count)).await;
+            let mut placed = placed.unwrap_or_default().into_iter();
+            (self.file, self.younger) = (placed.next(), placed.next());
+        }
+        let mut cutter = Cutter::default();
+        loop {
+            self.changed.mark_unchanged();
+            // Known before the file is read: nothing is written to it afterwards, and its end is the end.
+            let is_complete = self.changed.has_changed().is_err();
+            let lines = match self.file.as_mut().map(|file| cutter.read(file)) {
+                None => Vec::new(),
+                Some(Ok(lines)) => lines,
+                Some(Err(error)) => {
+                    self.file = None;
+                    vec![note(format!("the log could not be read on: {error}"))]
+                }
+            };
+            if !lines.is_empty() {
+                for line in lines {
+                    if !self.send(line).await {
+                        return;
+                    }
+                }
+                continue;
+            }
+            // The end, for now. Nothing more is written to a file once a younger one is known, which was so before the last read.
+            if let Some(younger) = self.younger.take() {
+                self.file = Some(younger);
                 cutter.rest.clear();
                 continue;
             }
-            match opened.try_recv() {
-                Ok(younger) => next = Some(younger),
-                Err(TryRecvError::Disconnected) if complete => return,
-                Err(TryRecvError::Disconnected) => complete = true,
-                Err(TryRecvError::Empty) => {
-                    tokio::select! {
-                        // An error means that the log is complete, which the next round sees.
-                        _ = changed.changed() => {}
-                        () = sender.closed() => return,
+            self.younger = self.opened.take();
+            if self.younger.is_some() {
+                continue;
+            }
+            if is_complete {
+                return;
+            }
+            tokio::select! {
+                // An error means that the log is complete, which the next round sees.
+                _ = self.changed.changed() => {}
+                () = self.sender.closed() => return,
+            }
+        }
+    }
+
+    /// Sends a line, and lets go of files that were rotated away while the receiver does not take it: they are removed, and only what reads
+    /// them keeps them on the disk. False: nobody receives any more.
+    async fn send(&mut self, line: LogLine) -> bool {
+        let mut is_open = true;
+        loop {
+            tokio::select! {
+                biased;
+                permit = self.sender.reserve() => {
+                    return permit.map(|permit| permit.send(line)).is_ok();
+                }
+                changed = self.changed.changed(), if is_open => {
+                    is_open = changed.is_ok();
+                    if self.opened.has_skipped() {
+                        (self.file, self.younger) = (None, None);
                     }
                 }
-            }
-            continue;
-        };
-        for line in lines {
-            if sender.send(line).await.is_err() {
-                return;
             }
         }
     }
@@ -313,117 +344,4 @@ fn note(line: String) -> LogLine {
 }
 
 #[cfg(test)]
-mod tests {
-    use tokio::sync::oneshot;
-
-    use super::*;
-    use crate::logs::Writer;
-
-    async fn all(mut lines: mpsc::Receiver<LogLine>) -> Vec<String> {
-        let mut seen = Vec::new();
-        while let Some(line) = lines.recv().await {
-            seen.push(line.line);
-        }
-        seen
-    }
-
-    #[tokio::test]
-    async fn every_line_arrives_in_order_across_rotations() {
-        let home = tempfile::tempdir().unwrap();
-        let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 4000, u64::MAX).unwrap();
-        writer.append("/a", "stdout", "0");
-        let (end, ended) = oneshot::channel::<()>();
-        let lines = follow(path.clone(), true, async { drop(ended.await) }, ());
-        for number in 1..500 {
-            writer.append("/a", "stdout", &number.to_string());
-            // Lets the discovery run, as it does beside another process. Nobody receives yet.
-            tokio::task::yield_now().await;
-            tokio::task::yield_now().await;
-        }
-        end.send(()).unwrap();
-        let expected: Vec<_> = (0..500).map(|number| number.to_string()).collect();
-        assert_eq!(all(lines).await, expected);
-        assert!(rotated(&path).exists(), "it was rotated");
-    }
-
-    #[tokio::test]
-    async fn from_now_on_means_from_now_on_and_removal_loses_nothing() {
-        let home = tempfile::tempdir().unwrap();
-        let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 1 << 20, u64::MAX).unwrap();
-        writer.append("/a", "stdout", "before");
-        let (end, ended) = oneshot::channel::<()>();
-        let lines = follow(path.clone(), false, async { drop(ended.await) }, ());
-        writer.append("/a", "stderr", "after");
-        drop(home);
-        end.send(()).unwrap();
-        assert_eq!(all(lines).await, ["after"]);
-    }
-
-    #[tokio::test]
-    async fn the_past_and_what_follows_come_once_each_by_their_place_and_not_by_their_time() {
-        let home = tempfile::tempdir().unwrap();
-        let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 1 << 20, u64::MAX).unwrap();
-        for number in 0..3 {
-            writer.append("/a", "stdout", &number.to_string());
-        }
-        let (sender, following) = mpsc::channel(4);
-        let lines = with_past(path, 2, following, ());
-        let line = |number, text: &str| LogLine {
-            number,
-            // The clock was set back.
-            time: SystemTime::UNIX_EPOCH,
-            line: text.into(),
-            ..note(String::new())
-        };
-        // Printed between the beginning of the following and the look back, and after it.
-        sender.send(line(Some(2), "2")).await.unwrap();
-        sender.send(line(Some(3), "3")).await.unwrap();
-        sender.send(line(None, "of the log itself")).await.unwrap();
-        drop(sender);
-        assert_eq!(all(lines).await, ["1", "2", "3", "of the log itself"]);
-    }
-
-    #[tokio::test]
-    async fn once_the_guard_is_dropped_the_log_may_go() {
-        let home = tempfile::tempdir().unwrap();
-        let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 200, u64::MAX).unwrap();
-        writer.append("/a", "stdout", "first");
-        let guards = watch::Sender::new(());
-        let (end, ended) = oneshot::channel::<()>();
-        let lines = follow(
-            path.clone(),
-            true,
-            async { drop(ended.await) },
-            guards.subscribe(),
-        );
-        writer.append("/a", "stdout", "second, rotated");
-        end.send(()).unwrap();
-        guards.closed().await;
-        drop(home);
-        assert_eq!(all(lines).await, ["first", "second, rotated"]);
-    }
-
-    #[tokio::test]
-    async fn a_reader_too_slow_is_told_what_it_missed() {
-        let home = tempfile::tempdir().unwrap();
-        let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 400, u64::MAX).unwrap();
-        writer.append("/a", "stdout", "0");
-        let lines = follow(path.clone(), true, std::future::ready(()), ());
-        for number in 1..100 {
-            writer.append("/a", "stdout", &number.to_string());
-        }
-        let seen = all(lines).await;
-        assert_eq!(seen[0], "0");
-        assert!(
-            seen.iter()
-                .any(|line| line.contains("lines were lost here")),
-            "{seen:?}"
-        );
-        assert_eq!(seen.last().unwrap(), "99");
-    }
-}
+mod tests;

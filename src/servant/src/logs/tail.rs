@@ -51,6 +51,49 @@ fn read(files: Vec<File>, count: usize, node: Option<&str>) -> Vec<LogLine> {
     newest_first
 }
 
+/// Those of a log's files, the oldest first, in which its last `count` lines are, each to be read from the first of these lines on.
+pub(super) fn seek_to_last(files: Vec<File>, count: usize) -> Vec<File> {
+    let mut wanted = count;
+    let mut newest_first = Vec::new();
+    for mut file in files.into_iter().rev() {
+        // What cannot be read is passed over.
+        let Ok(found) = seek_before_last(&mut file, wanted) else {
+            continue;
+        };
+        newest_first.push(file);
+        wanted -= found;
+        if wanted == 0 {
+            break;
+        }
+    }
+    newest_first.reverse();
+    newest_first
+}
+
+/// Has a file read from the first of its last `count` whole lines on, and gives how many of them there are.
+fn seek_before_last(file: &mut File, count: usize) -> io::Result<usize> {
+    let mut start = file.metadata()?.len();
+    let mut ends = 0;
+    let mut block = vec![0; BLOCK];
+    while start > 0 {
+        let length = start.min(BLOCK as u64);
+        start -= length;
+        let block = &mut block[..length as usize];
+        file.seek(SeekFrom::Start(start))?;
+        file.read_exact(block)?;
+        let ends_before = block.iter().enumerate().rev();
+        for (place, _) in ends_before.filter(|(_, byte)| **byte == b'\n') {
+            if ends == count {
+                file.seek(SeekFrom::Start(start + place as u64 + 1))?;
+                return Ok(count);
+            }
+            ends += 1;
+        }
+    }
+    file.rewind()?;
+    Ok(ends)
+}
+
 /// Gives the lines of a file from the last to the first, for as long as more are wanted.
 fn backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<()> {
     let mut start = file.metadata()?.len();
