@@ -14,13 +14,15 @@ use authority::Authority;
 use portal::{Robots, Tls};
 use store::private;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::pki_types::{
+    CertificateDer, CertificateRevocationListDer, PrivateKeyDer,
+};
 
 use crate::config;
 use crate::home::Home;
 
 pub use acme::{Renewal, listen_for_challenges};
-pub use files::keep;
+pub use files::{keep, keep_lists};
 
 /// Where the home has certificates and keys.
 const DIRECTORY: &str = "tls";
@@ -33,7 +35,7 @@ pub enum Error {
     /// A file that cannot be read, or holds something else.
     #[error("cannot read the {what} in {path}: {source}; it should be a PEM file")]
     Unreadable {
-        /// `certificate` or `key`.
+        /// `certificate`, `key` or `revocation list`.
         what: &'static str,
         /// The file.
         path: PathBuf,
@@ -43,6 +45,9 @@ pub enum Error {
     /// A file without one.
     #[error("{0} holds no certificate; it should be a PEM file with BEGIN CERTIFICATE")]
     None(PathBuf),
+    /// A file without a revocation list.
+    #[error("{0} holds no revocation list; it should be a PEM file with BEGIN X509 CRL")]
+    NoList(PathBuf),
     /// They do not belong together, or are of a kind that nobody knows.
     #[error("{path}: {source}")]
     Unusable {
@@ -87,6 +92,20 @@ fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error> {
         true => Err(Error::None(path.to_owned())),
         false => Ok(read),
     }
+}
+
+/// Has certificates refused that the lists of a file name.
+fn revoke(tls: &Tls, path: &Path) -> Result<(), Error> {
+    let lists = CertificateRevocationListDer::pem_file_iter(path)
+        .and_then(Iterator::collect::<Result<Vec<_>, _>>)
+        .map_err(unreadable("revocation list", path))?;
+    if lists.is_empty() {
+        return Err(Error::NoList(path.to_owned()));
+    }
+    tls.revoke(lists).map_err(|source| Error::Unusable {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 fn read(certificate: &Path, key: &Path) -> Result<Pair, Error> {
@@ -144,6 +163,9 @@ pub fn tls(
         None => Vec::new(),
     };
     let tls = Tls::new(chain, key, robots.authority.certificate(), others).map_err(unusable)?;
+    if let Some(path) = &config.client_revocations {
+        revoke(&tls, path)?;
+    }
     if config.acme.is_none() {
         own::warn_of_other_names(&tls, &config.names);
     }

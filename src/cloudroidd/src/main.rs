@@ -263,6 +263,10 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         let keeping = certificates::keep(Arc::clone(&app), certificate, key);
         tokio::spawn(privilege::run(keeping));
     }
+    if let Some(lists) = config.tls.client_revocations.clone() {
+        let keeping = certificates::keep_lists(Arc::clone(&app), lists);
+        tokio::spawn(privilege::run(keeping));
+    }
     if let Some(acme) = config.tls.acme.clone() {
         if let Some(looked_at) = looked_at {
             tokio::spawn(portal::serve_challenges(Arc::clone(&app), looked_at));

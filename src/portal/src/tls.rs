@@ -16,7 +16,9 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::pki_types::{
+    CertificateDer, CertificateRevocationListDer, PrivateKeyDer,
+};
 use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert, WebPkiClientVerifier};
 use tokio_rustls::rustls::sign::CertifiedKey;
 use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
@@ -41,8 +43,10 @@ pub struct TlsError(#[from] rustls::Error);
 
 /// TLS as the portal speaks it. What it shows can be replaced while it listens.
 pub struct Tls {
-    config: Arc<ServerConfig>,
+    config: RwLock<Arc<ServerConfig>>,
     shown: Arc<Shown>,
+    /// Authorities that sign robots' certificates.
+    roots: Arc<RootCertStore>,
     trusts_others: bool,
 }
 
@@ -104,6 +108,30 @@ fn checked(
     Ok(Arc::new(key))
 }
 
+/// Asks clients for certificates that one of `roots` has signed and no list names.
+fn configure(
+    roots: &Arc<RootCertStore>,
+    shown: &Arc<Shown>,
+    lists: Vec<CertificateRevocationListDer<'static>>,
+) -> Result<Arc<ServerConfig>, TlsError> {
+    let provider = Arc::new(ring::default_provider());
+    let clients =
+        WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), Arc::clone(&provider))
+            .with_crls(lists)
+            // The daemon's own authority has no list: whom it has signed is unpaired.
+            .allow_unknown_revocation_status()
+            .allow_unauthenticated()
+            .build()
+            .map_err(|error| rustls::Error::General(error.to_string()))?;
+    let builder =
+        ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
+    let mut config = builder
+        .with_client_cert_verifier(clients)
+        .with_cert_resolver(Arc::clone(shown) as Arc<dyn ResolvesServerCert>);
+    config.alpn_protocols = vec![HTTP_1_1.to_vec(), ACME_TLS_1.to_vec()];
+    Ok(Arc::new(config))
+}
+
 impl Tls {
     /// Shows a certificate, followed by those that lead from it to an authority. Asks clients for one, and takes those that the
     /// daemon's authority for robots has signed, or one of `others`; who has none is let in without.
@@ -118,27 +146,28 @@ impl Tls {
         for root in others.into_iter().chain([robots.clone()]) {
             roots.add(root)?;
         }
-        let provider = Arc::new(ring::default_provider());
-        let clients =
-            WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
-                .allow_unauthenticated()
-                .build()
-                .map_err(|error| rustls::Error::General(error.to_string()))?;
+        let roots = Arc::new(roots);
         let shown = Arc::new(Shown {
             current: RwLock::new(checked(chain, key)?),
             challenges: RwLock::default(),
         });
-        let builder =
-            ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
-        let mut config = builder
-            .with_client_cert_verifier(clients)
-            .with_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesServerCert>);
-        config.alpn_protocols = vec![HTTP_1_1.to_vec(), ACME_TLS_1.to_vec()];
         Ok(Tls {
-            config: Arc::new(config),
+            config: RwLock::new(configure(&roots, &shown, Vec::new())?),
             shown,
+            roots,
             trusts_others,
         })
+    }
+
+    /// Refuses from now on certificates that these lists name, and no others any more. Nobody goes on with a session of TLS that was begun
+    /// before. A list whose time is over counts on: an authority that is late lets nobody in again.
+    pub fn revoke(
+        &self,
+        lists: Vec<CertificateRevocationListDer<'static>>,
+    ) -> Result<(), TlsError> {
+        let config = configure(&self.roots, &self.shown, lists)?;
+        *self.config.write() = config;
+        Ok(())
     }
 
     /// Shows another from now on. Connections that stand go on.
@@ -209,7 +238,7 @@ impl Tls {
         if first[0] != HANDSHAKE {
             return Ok(Accepted::Plain(stream));
         }
-        let acceptor = TlsAcceptor::from(Arc::clone(&self.config));
+        let acceptor = TlsAcceptor::from(Arc::clone(&self.config.read()));
         match acceptor.accept(stream).into_fallible().await {
             Ok(mut stream) if stream.get_ref().1.alpn_protocol() == Some(ACME_TLS_1) => {
                 let _ = tokio::time::timeout(LINGER, stream.shutdown()).await;
@@ -270,3 +299,6 @@ async fn refuse(uri: Uri, headers: HeaderMap) -> Response {
     response.headers_mut().insert(header::CONNECTION, close);
     response
 }
+
+#[cfg(test)]
+mod tests;

@@ -26,6 +26,8 @@ pub struct Tls {
     pub robot_certificates: Time,
     /// PEM file of authorities of the lab's own that sign robots' certificates, besides the daemon's.
     pub client_authorities: Option<PathBuf>,
+    /// PEM file of revocation lists (RFC 5280) of these authorities.
+    pub client_revocations: Option<PathBuf>,
     /// Whom the daemon asks for its certificate.
     pub acme: Option<Acme>,
 }
@@ -39,6 +41,7 @@ impl Default for Tls {
             names: Vec::new(),
             robot_certificates: Time::seconds(7 * 86_400),
             client_authorities: None,
+            client_revocations: None,
             acme: None,
         }
     }
@@ -108,6 +111,11 @@ impl Tls {
                 "names are for the certificate that the daemon makes, and another is named; remove one of both"
             );
         }
+        if self.client_revocations.is_some() && self.client_authorities.is_none() {
+            bail!(
+                "client_revocations names lists of authorities that client_authorities does not name; name them, too"
+            );
+        }
         if self.robot_certificates.0 < SHORTEST {
             bail!(
                 "robot_certificates is {:?}, and robots have to renew them in time; make it 1s at least, 168h is usual",
@@ -157,6 +165,7 @@ mod tests {
         for (text, words) in [
             ("certificate = \"c\"", "file of its key"),
             ("key = \"k\"", "file of its certificate"),
+            ("client_revocations = \"r\"", "client_authorities"),
             (
                 "serve = \"plain-text-beyond-loopback\"\ncertificate = \"c\"\nkey = \"k\"",
                 "remove one",
