@@ -2,25 +2,33 @@
 //!
 //! An address may send some tokens that are not known; after each further one it waits, twice as long each time up to a bound,
 //! and what it sends meanwhile is not looked at. A good token makes nobody a better guesser: only time forgets.
+//!
+//! An address of IPv6 is one of as many as its owner likes: its networks are counted beside it, of a host (/64), of a site (/48) and of a
+//! provider (/32), each of which may guess sixteen times as often as the one within. So nobody fills the table with addresses of one network.
+//! Whoever has a great many networks gets the table full, and that holds up nobody: then who has not guessed for the longest time is forgotten.
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::net::{IpAddr, Ipv6Addr};
+
+use crate::Host;
+use crate::host::{OF_PROVIDER, OF_SITE};
 
 /// Milliseconds since any beginning.
 type Millis = u64;
 
 /// Tokens that are not known before an address waits.
 pub const FREE: u32 = 10;
+/// How many times as many a network may send as one of those within.
+const WIDER: u32 = 16;
 /// The first wait, and the longest.
 const SHORTEST: Millis = 1_000;
 const LONGEST: Millis = 60_000;
 /// What an address has guessed is forgotten so long after its last guess.
 const FORGOTTEN: Millis = 600_000;
-/// Addresses that are told apart. Those beyond are taken for one, so that a great many cannot make one forgotten.
-pub const ADDRESSES: usize = 4_096;
+/// Addresses and networks, or accounts, that are remembered.
+pub const REMEMBERED: usize = 4_096;
 
-/// What came from one address.
+/// What came from one address or network.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 struct Guessed {
     times: u32,
@@ -32,9 +40,9 @@ impl Guessed {
         now.saturating_sub(self.last) >= FORGOTTEN
     }
 
-    /// How long it still waits.
-    fn wait(&self, now: Millis) -> Option<Millis> {
-        let beyond = self.times.checked_sub(FREE)?;
+    /// How long it still waits that may send `free` of them before.
+    fn wait(&self, free: u32, now: Millis) -> Option<Millis> {
+        let beyond = self.times.checked_sub(free)?;
         let whole = SHORTEST
             .checked_shl(beyond.min(32))
             .map_or(LONGEST, |pause| pause.min(LONGEST));
@@ -52,53 +60,57 @@ impl Guessed {
     }
 }
 
+/// By what guesses are counted.
+pub trait Guesser: Eq + Hash + Clone {
+    /// Itself, and those of which it is a part, each with how many guesses it may make before it waits.
+    fn allowances(&self) -> Vec<(Self, u32)>;
+}
+
+/// By an account's name.
+impl Guesser for String {
+    fn allowances(&self) -> Vec<(String, u32)> {
+        vec![(self.clone(), FREE)]
+    }
+}
+
+impl Guesser for Host {
+    fn allowances(&self) -> Vec<(Host, u32)> {
+        let mut allowances = vec![(*self, FREE)];
+        if self.is_wide() {
+            allowances.push((self.within(OF_SITE), FREE * WIDER));
+            allowances.push((self.within(OF_PROVIDER), FREE * WIDER * WIDER));
+        }
+        allowances
+    }
+}
+
 /// What came from all addresses, or at all accounts.
 #[derive(Debug)]
-pub struct Guesses<Of: Eq + Hash = Host> {
-    by_address: HashMap<Of, Guessed>,
-    /// From addresses for which there was no room.
-    others: Guessed,
+pub struct Guesses<Of: Guesser = Host> {
+    remembered: HashMap<Of, Guessed>,
     unknown: u64,
     slowed: u64,
 }
 
-impl<Of: Eq + Hash> Default for Guesses<Of> {
+impl<Of: Guesser> Default for Guesses<Of> {
     fn default() -> Self {
         Guesses {
-            by_address: HashMap::new(),
-            others: Guessed::default(),
+            remembered: HashMap::new(),
             unknown: 0,
             slowed: 0,
         }
     }
 }
 
-/// What one host has: an IPv4 address, or a network of IPv6, of which it can choose any.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Host(IpAddr);
-
-impl From<IpAddr> for Host {
-    fn from(address: IpAddr) -> Host {
-        Host(match address.to_canonical() {
-            IpAddr::V6(address) => {
-                let network = u128::from(address) & (u128::MAX << 64);
-                IpAddr::V6(Ipv6Addr::from(network))
-            }
-            address => address,
-        })
-    }
-}
-
-impl<Of: Eq + Hash> Guesses<Of> {
+impl<Of: Guesser> Guesses<Of> {
     /// Whether a token from `address` may be looked at; else for how many milliseconds not, and it is counted as slowed.
     pub fn ask(&mut self, address: impl Into<Of>, now: Millis) -> Result<(), Millis> {
-        let known = self.by_address.get(&address.into());
-        let full = self.by_address.len() >= ADDRESSES;
-        let guessed = match known {
-            Some(guessed) => Some(guessed),
-            None => full.then_some(&self.others),
-        };
-        match guessed.and_then(|guessed| guessed.wait(now)) {
+        let waits = address
+            .into()
+            .allowances()
+            .into_iter()
+            .filter_map(|(of, free)| self.remembered.get(&of)?.wait(free, now));
+        match waits.max() {
             None => Ok(()),
             Some(left) => {
                 self.slowed += 1;
@@ -110,19 +122,28 @@ impl<Of: Eq + Hash> Guesses<Of> {
     /// Counts a token from `address` that was looked at and is not known; how long the address waits now.
     pub fn failed(&mut self, address: impl Into<Of>, now: Millis) -> Option<Millis> {
         self.unknown += 1;
-        let host = address.into();
-        if self.by_address.len() >= ADDRESSES && !self.by_address.contains_key(&host) {
-            self.by_address
-                .retain(|_, guessed| !guessed.is_forgotten(now));
+        let counted = address.into().allowances().into_iter();
+        let waits = counted.map(|(of, free)| {
+            self.make_room(&of);
+            let guessed = self.remembered.entry(of).or_default();
+            guessed.add(now);
+            guessed.wait(free, now)
+        });
+        waits.max().flatten()
+    }
+
+    /// Forgets who has not guessed for the longest time, where there is no room for another.
+    fn make_room(&mut self, newcomer: &Of) {
+        if self.remembered.len() < REMEMBERED || self.remembered.contains_key(newcomer) {
+            return;
         }
-        let full = self.by_address.len() >= ADDRESSES;
-        let guessed = match self.by_address.get_mut(&host) {
-            Some(guessed) => guessed,
-            None if full => &mut self.others,
-            None => self.by_address.entry(host).or_default(),
-        };
-        guessed.add(now);
-        guessed.wait(now)
+        let oldest = self
+            .remembered
+            .iter()
+            .min_by_key(|(_, guessed)| guessed.last);
+        if let Some(oldest) = oldest.map(|(of, _)| of.clone()) {
+            self.remembered.remove(&oldest);
+        }
     }
 
     /// Tokens that were not known, and those that were not looked at.
@@ -133,6 +154,8 @@ impl<Of: Eq + Hash> Guesses<Of> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::{IpAddr, Ipv6Addr};
+
     use proptest::prelude::*;
 
     use super::*;
@@ -184,21 +207,56 @@ mod tests {
     }
 
     #[test]
-    fn many_addresses_make_none_forgotten_and_are_slowed_as_one() {
+    fn who_has_a_network_of_ipv6_is_slowed_and_nobody_else() {
+        for (bits, hosts) in [(12, 4_096_u128), (32, 1 << 14)] {
+            let mut guesses = Guesses::<Host>::default();
+            let base = u128::from("2001:db8::".parse::<Ipv6Addr>().expect("an address"));
+            let mut looked_at = 0;
+            for number in 0..hosts {
+                // As far apart as the network has room for: /52, and all of the provider's /32.
+                let from = base + ((number << 64) << (bits - hosts.ilog2()));
+                let from = IpAddr::V6(Ipv6Addr::from(from));
+                if guesses.ask(from, 1).is_ok() {
+                    looked_at += 1;
+                    guesses.failed(from, 1);
+                }
+            }
+            let most = if bits == 12 {
+                FREE * WIDER
+            } else {
+                FREE * WIDER * WIDER
+            };
+            assert_eq!(looked_at, most, "{bits}");
+            assert!(guesses.remembered.len() < REMEMBERED);
+            for other in ["2001:db9::1", "192.0.2.1"] {
+                assert_eq!(guesses.ask(address(other), 2), Ok(()), "{other}");
+                assert_eq!(guesses.failed(address(other), 2), None, "{other}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_great_many_addresses_hold_up_nobody_and_the_longest_quiet_are_forgotten() {
         let mut guesses = Guesses::<Host>::default();
-        guess_freely(&mut guesses, "10.0.0.7", 0);
-        guesses.failed(address("10.0.0.7"), 0);
         let many = |number: u32| IpAddr::V4((0x0b00_0000 + number).into());
-        for number in 0..ADDRESSES as u32 + FREE {
+        for number in 0..REMEMBERED as u32 {
             guesses.failed(many(number), 1);
         }
-        assert_eq!(guesses.by_address.len(), ADDRESSES);
-        assert!(guesses.ask(address("10.0.0.7"), 2).is_err());
-        assert!(guesses.ask(address("192.0.2.1"), 2).is_err(), "one of them");
-        assert_eq!(guesses.ask(many(0), 2), Ok(()), "has a place of its own");
-        // Who comes when they are forgotten has one, too.
-        guesses.failed(address("192.0.2.1"), FORGOTTEN + 2);
-        assert_eq!(guesses.by_address.len(), 1);
+        guess_freely(&mut guesses, "10.0.0.7", 2);
+        guesses.failed(address("10.0.0.7"), 2);
+        for number in 0..REMEMBERED as u32 - 1 {
+            guesses.failed(many(1 << 20 | number), 3);
+        }
+        assert_eq!(guesses.remembered.len(), REMEMBERED);
+        assert!(
+            guesses.ask(address("10.0.0.7"), 3).is_err(),
+            "it has a place"
+        );
+        // Who was never there is looked at as ever, and slowed as soon as any.
+        assert_eq!(guesses.ask(address("192.0.2.1"), 3), Ok(()));
+        guess_freely(&mut guesses, "192.0.2.1", 3);
+        assert!(guesses.failed(address("192.0.2.1"), 3).is_some());
+        assert_eq!(guesses.remembered.len(), REMEMBERED);
     }
 
     proptest! {

@@ -214,17 +214,12 @@ impl Provider {
             verifier,
             earlier,
         };
-        let kept = self
-            .pending
-            .lock()
-            .keep(state.into_secret(), waiting, Instant::now());
-        match kept {
-            true => Ok(Begun {
-                url: url.into(),
-                browser,
-            }),
-            false => Err(Error::Busy),
-        }
+        let mut pending = self.pending.lock();
+        pending.keep(state.into_secret(), waiting, Instant::now());
+        Ok(Begun {
+            url: url.into(),
+            browser,
+        })
     }
 
     /// What was begun by this state, in the browser that is known by `browser`: once.

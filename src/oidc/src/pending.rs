@@ -4,14 +4,14 @@ use std::collections::HashMap;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
-use access::Host;
+use access::{Host, largest_network};
 use openidconnect::{Nonce, PkceCodeVerifier};
 
 use crate::Error;
 
 /// How long somebody may take to say to the provider who it is.
 const TIME: Duration = Duration::from_secs(600);
-/// Sign-ins under way, of all and of one host; of that, the oldest makes room for a new one.
+/// Sign-ins under way, of all and of one host. The oldest of that host, or of the network that has the most, makes room for a new one.
 const MOST: usize = 4096;
 const MOST_OF_ONE: usize = 64;
 
@@ -39,26 +39,27 @@ pub struct Pending {
 }
 
 impl Pending {
-    /// Keeps a sign-in; false where there are too many.
-    pub fn keep(&mut self, state: String, waiting: Waiting, now: Instant) -> bool {
+    /// Keeps a sign-in.
+    pub fn keep(&mut self, state: String, waiting: Waiting, now: Instant) {
         self.all.retain(|_, (begun, _)| is_good(*begun, now));
         let of = Host::from(waiting.from);
-        let alike = || {
-            self.all
-                .iter()
-                .filter(|(_, (_, it))| Host::from(it.from) == of)
-        };
-        if alike().count() >= MOST_OF_ONE {
-            let oldest = alike().min_by_key(|(_, (begun, _))| *begun);
-            if let Some(oldest) = oldest.map(|(state, _)| state.clone()) {
-                self.all.remove(&oldest);
-            }
-        }
-        if self.all.len() >= MOST {
-            return false;
+        let hosts = || self.all.values().map(|(_, it)| Host::from(it.from));
+        if hosts().filter(|host| *host == of).count() >= MOST_OF_ONE {
+            self.forget_oldest(|host| host == of);
+        } else if self.all.len() >= MOST {
+            let network = largest_network(hosts());
+            self.forget_oldest(|host| Some(host.network()) == network);
         }
         self.all.insert(state, (now, waiting));
-        true
+    }
+
+    fn forget_oldest(&mut self, is_meant: impl Fn(Host) -> bool) {
+        let meant = self.all.iter();
+        let meant = meant.filter(|(_, (_, it))| is_meant(it.from.into()));
+        let oldest = meant.min_by_key(|(_, (begun, _))| *begun);
+        if let Some(oldest) = oldest.map(|(state, _)| state.clone()) {
+            self.all.remove(&oldest);
+        }
     }
 
     /// What was begun by a state. Whoever comes with it, it is good for nobody any more.
@@ -105,7 +106,7 @@ mod tests {
     fn a_state_is_good_once_for_its_browser_and_its_time() {
         let (mut pending, now) = (Pending::default(), Instant::now());
         for state in ["a", "b", "c", "d"] {
-            assert!(pending.keep(state.into(), waiting("192.0.2.1"), now));
+            pending.keep(state.into(), waiting("192.0.2.1"), now);
         }
         let mine = Some("browser");
         pending.take("a", mine, now).map(|_| ()).expect("begun");
@@ -141,11 +142,11 @@ mod tests {
     #[test]
     fn whoever_begins_many_pushes_out_its_own() {
         let (mut pending, now) = (Pending::default(), Instant::now());
-        assert!(pending.keep("other".into(), waiting("192.0.2.9"), now));
+        pending.keep("other".into(), waiting("192.0.2.9"), now);
         for number in 0..=MOST_OF_ONE as u32 {
             let from = format!("2001:db8::{number:x}");
             let at = now + Duration::from_millis(number.into());
-            assert!(pending.keep(number.to_string(), waiting(&from), at));
+            pending.keep(number.to_string(), waiting(&from), at);
         }
         assert_eq!(pending.all.len(), MOST_OF_ONE + 1);
         assert!(!pending.all.contains_key("0"), "the oldest");
@@ -153,14 +154,19 @@ mod tests {
     }
 
     #[test]
-    fn there_are_no_more_than_so_many() {
+    fn who_has_a_great_network_takes_no_more_than_there_are_places_and_pushes_out_its_own() {
         let (mut pending, now) = (Pending::default(), Instant::now());
-        for number in 0..MOST {
-            let from = format!("10.0.{}.{}", number / 256, number % 256);
-            assert!(pending.keep(number.to_string(), waiting(&from), now));
+        pending.keep("other".into(), waiting("192.0.2.1"), now);
+        for number in 0..MOST + 9 {
+            // Each is another host, of one site.
+            let from = format!("2001:db8:0:{number:x}::1");
+            let at = now + Duration::from_millis(1 + number as u64);
+            pending.keep(number.to_string(), waiting(&from), at);
         }
-        assert!(!pending.keep("more".into(), waiting("192.0.2.1"), now));
-        assert!(pending.keep("later".into(), waiting("192.0.2.1"), now + TIME));
+        assert_eq!(pending.all.len(), MOST);
+        assert!(pending.all.contains_key("other"));
+        assert!(!pending.all.contains_key("0"), "the oldest of its own");
+        pending.keep("later".into(), waiting("192.0.2.1"), now + 2 * TIME);
         assert_eq!(pending.all.len(), 1);
     }
 }

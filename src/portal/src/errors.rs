@@ -120,6 +120,9 @@ pub enum Error {
     /// The name is another account's.
     #[error("there is an account {0:?} already")]
     AccountExists(String),
+    /// The name is that of a robot that is paired, or for which a code waits.
+    #[error("there is a robot {0:?} already, which is paired or is to be")]
+    PairingExists(String),
     /// The password is wrong, or there is no such account: which of both is not said.
     #[error("name or password is wrong")]
     WrongPassword,
@@ -449,6 +452,7 @@ impl Error {
             Error::UnknownPairing { .. } => (S::NOT_FOUND, "unknown-pairing", "unknown robot"),
             Error::UnknownAccount { .. } => (S::NOT_FOUND, "unknown-account", "unknown account"),
             Error::AccountExists(_) => (S::CONFLICT, "account-exists", "name taken"),
+            Error::PairingExists(_) => (S::CONFLICT, "pairing-exists", "name taken"),
             Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https is spoken here"),
             Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),

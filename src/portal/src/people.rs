@@ -1,6 +1,7 @@
 //! `/api/v1/session`, `/api/v1/sessions`, `/api/v1/accounts`: people sign in and out, and admins see to their accounts.
 
 pub mod cookies;
+mod lanes;
 pub mod passwords;
 pub mod provider;
 
@@ -24,7 +25,7 @@ use crate::audit::About;
 use crate::errors::Error;
 use crate::principals::{Begun, Shown};
 use crate::query::Query;
-use passwords::Looked;
+use passwords::{Attempt, Looked};
 
 /// The longest body: a name, a password, and patterns of services.
 const LARGEST: usize = 16 << 10;
@@ -175,12 +176,18 @@ async fn signed_in(
     let mut candidate = app.principals.candidate(&name);
     let known = candidate.is_some().then(|| name.clone());
     let from = caller.peer.ip();
-    let written = candidate
-        .as_ref()
-        .map(|candidate| candidate.password.clone());
-    // Asked when it is its turn: what was tried meanwhile counts.
-    let before = || Ok(app.principals.may_try(&name, from, store::now())?);
-    let looked = app.passwords.look(written, password, before).await;
+    let attempt = Attempt {
+        from,
+        name: name.clone(),
+        known: candidate
+            .as_ref()
+            .map(|candidate| candidate.password.clone()),
+        password,
+    };
+    let may_try = || Ok(app.principals.may_try(&name, from, store::now())?);
+    may_try().map_err(|error| (known.clone(), error))?;
+    // Asked once more when it is its turn: what was tried meanwhile counts.
+    let looked = app.passwords.look(attempt, may_try).await;
     let looked = looked.map_err(|error| (known.clone(), error))?;
     let begun = match (looked, &mut candidate) {
         (Looked::Wrong, _) | (_, None) => None,

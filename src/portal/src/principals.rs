@@ -121,8 +121,10 @@ pub struct Principals {
     state: Arc<State>,
     stored: RwLock<Stored>,
     guesses: Mutex<Guesses>,
-    /// Wrong passwords, by account; those of names that are no account's, too.
+    /// Wrong passwords, by account.
     wrong: Mutex<Guesses<String>>,
+    /// Passwords for names that are no account's, by name. They are slowed alike, and make nothing of an account's forgotten.
+    in_vain: Mutex<Guesses<String>>,
     /// How long sessions last.
     lasting: Lasting,
     /// Grows by one with every change.
@@ -138,6 +140,7 @@ impl Principals {
             state,
             guesses: Mutex::default(),
             wrong: Mutex::default(),
+            in_vain: Mutex::default(),
             lasting: Lasting::default(),
             changed: watch::Sender::new(0),
         };
@@ -174,16 +177,25 @@ impl Principals {
         })
     }
 
+    /// Where wrong passwords for an account of that name are counted.
+    fn wrong_at(&self, account: &str) -> &Mutex<Guesses<String>> {
+        if self.has_account(account) {
+            &self.wrong
+        } else {
+            &self.in_vain
+        }
+    }
+
     /// Whether a password may be looked at that came from an address, for an account of that name.
     pub fn may_try(&self, account: &str, from: IpAddr, now: Millis) -> Result<(), Unrecognised> {
-        let by_account = self.wrong.lock().ask(account, now);
+        let by_account = self.wrong_at(account).lock().ask(account, now);
         let by_address = by_account.and_then(|()| self.guesses.lock().ask(from, now));
         by_address.map_err(Unrecognised::SlowedSignIn)
     }
 
     /// Counts a password that was looked at and is wrong.
     pub fn wrong_password(&self, account: &str, from: IpAddr, now: Millis) {
-        let by_account = self.wrong.lock().failed(account, now);
+        let by_account = self.wrong_at(account).lock().failed(account, now);
         let by_address = self.guesses.lock().failed(from, now);
         if let Some(wait) = by_account.max(by_address) {
             let seconds = wait.div_ceil(1000);
@@ -210,7 +222,9 @@ impl Principals {
 
     /// Passwords since the daemon started that were wrong, and those that were not looked at for their account's sake.
     pub fn mistaken(&self) -> (u64, u64) {
-        self.wrong.lock().counts()
+        let (wrong, slowed) = self.wrong.lock().counts();
+        let (in_vain, in_vain_slowed) = self.in_vain.lock().counts();
+        (wrong + in_vain, slowed + in_vain_slowed)
     }
 
     /// Tokens since the daemon started that were not known, and those that were not looked at.

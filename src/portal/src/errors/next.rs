@@ -39,12 +39,15 @@ impl Error {
             Error::AccountExists(name) => format!(
                 "choose another name, or remove it with: cloudroidctl account remove {name}"
             ),
+            Error::PairingExists(name) => format!(
+                "choose another name, or end the pairing with: cloudroidctl unpair {name}"
+            ),
             Error::WrongPassword => {
                 "try again, or have an admin set another password with: cloudroidctl account passwd NAME".into()
             }
             Error::SignInBusy => "try again later".into(),
             Error::TooManyStreams { .. } => {
-                "close pages of the portal that are open elsewhere, then load this one again".into()
+                "close pages of the portal that are open elsewhere, or end commands that follow something (cloudroidctl logs -f), then try again".into()
             }
             Error::TooManyLook { .. } => {
                 "close pages that look into it elsewhere, then try again".into()

@@ -2,21 +2,24 @@
 //! asks for at least. Kept in the PHC string format, which has the parameters: a hash with others is made anew when its owner
 //! signs in.
 
-use std::sync::{Arc, LazyLock};
+use std::net::IpAddr;
+use std::sync::OnceLock;
 
 use argon2::password_hash::rand_core::OsRng;
-use argon2::password_hash::{self, PasswordHash, SaltString};
-use argon2::{Algorithm, Argon2, Params, PasswordHasher, PasswordVerifier, Version};
-use tokio::sync::Semaphore;
+use argon2::password_hash::{self, Output, ParamsString, PasswordHash, Salt, SaltString};
+use argon2::{Algorithm, Argon2, Block, Params, PasswordVerifier, Version};
 
+use super::lanes::{Held, Holders, Lane, Turn};
 use crate::errors::Error;
 
 /// KiB, passes and lanes.
 const MEMORY: u32 = 19 * 1024;
 const PASSES: u32 = 2;
 const LANES: u32 = 1;
-/// Hashes that are made at once, and requests that may wait for theirs: who signs in takes no more than this of the machine.
+/// Hashes that are made at once, of accounts and of names that nobody has, and requests that may wait for theirs, in each of the two lanes:
+/// who signs in takes no more than this of the machine.
 const AT_ONCE: usize = 2;
+const AT_ONCE_IN_VAIN: usize = 1;
 const WAITING: usize = 32;
 /// Characters that a password has at least, and bytes that it may have.
 const SHORTEST: usize = 12;
@@ -71,19 +74,33 @@ pub enum Looked {
 
 /// Makes hashes, a few at once, on threads where they hold up nothing.
 pub struct Passwords {
-    /// Those that are made.
-    working: Arc<Semaphore>,
-    /// Those that are made or waited for.
-    room: Arc<Semaphore>,
+    /// Of people who have an account, and of accounts that are made.
+    accounts: Lane,
+    /// Of names that nobody has.
+    made_up: Lane,
+    holders: Holders,
 }
 
 impl Default for Passwords {
     fn default() -> Self {
         Passwords {
-            working: Arc::new(Semaphore::new(AT_ONCE)),
-            room: Arc::new(Semaphore::new(AT_ONCE + WAITING)),
+            accounts: Lane::new(AT_ONCE, WAITING),
+            made_up: Lane::new(AT_ONCE_IN_VAIN, WAITING),
+            holders: Holders::default(),
         }
     }
+}
+
+/// A password that is tried.
+pub struct Attempt {
+    /// From where.
+    pub from: IpAddr,
+    /// For which account, which need not exist.
+    pub name: String,
+    /// The account's hash; none where there is no such account.
+    pub known: Option<String>,
+    /// The password.
+    pub password: String,
 }
 
 fn argon2() -> Result<Argon2<'static>, password_hash::Error> {
@@ -91,17 +108,38 @@ fn argon2() -> Result<Argon2<'static>, password_hash::Error> {
     Ok(Argon2::new(Algorithm::Argon2id, Version::V0x13, params))
 }
 
-fn hash(password: &str) -> Result<String, password_hash::Error> {
+/// What today's parameters make of a password and a salt.
+fn compute(
+    password: &str,
+    salt: Salt<'_>,
+    memory: &mut [Block],
+) -> Result<Output, password_hash::Error> {
+    let mut decoded = [0; Salt::MAX_LENGTH];
+    let salt = salt.decode_b64(&mut decoded)?;
+    Output::init_with(Params::DEFAULT_OUTPUT_LEN, |out| {
+        let argon2 = argon2()?;
+        Ok(argon2.hash_password_into_with_memory(password.as_bytes(), salt, out, memory)?)
+    })
+}
+
+fn hash(password: &str, memory: &mut [Block]) -> Result<String, password_hash::Error> {
     let salt = SaltString::generate(&mut OsRng);
-    let hash = argon2()?.hash_password(password.as_bytes(), &salt)?;
+    let output = compute(password, salt.as_salt(), memory)?;
+    let hash = PasswordHash {
+        algorithm: Algorithm::Argon2id.ident(),
+        version: Some(Version::V0x13.into()),
+        params: ParamsString::try_from(argon2()?.params())?,
+        salt: Some(salt.as_salt()),
+        hash: Some(output),
+    };
     Ok(hash.to_string())
 }
 
 /// Whose password nobody knows: looking at it takes as long as at another's.
-fn nobodys() -> Result<&'static str, password_hash::Error> {
-    static HASH: LazyLock<Result<String, password_hash::Error>> =
-        LazyLock::new(|| hash(&catalogue::names::random(32)));
-    HASH.as_deref().map_err(|error| *error)
+fn nobodys(memory: &mut [Block]) -> Result<&'static str, password_hash::Error> {
+    static HASH: OnceLock<Result<String, password_hash::Error>> = OnceLock::new();
+    let made = HASH.get_or_init(|| hash(&catalogue::names::random(32), memory));
+    made.as_deref().map_err(|error| *error)
 }
 
 fn is_todays(hash: &PasswordHash<'_>) -> bool {
@@ -111,152 +149,88 @@ fn is_todays(hash: &PasswordHash<'_>) -> bool {
     });
     same && hash.algorithm == Algorithm::Argon2id.ident()
         && hash.version == Some(Version::V0x13.into())
+        && hash
+            .hash
+            .is_some_and(|output| output.len() == Params::DEFAULT_OUTPUT_LEN)
 }
 
-fn look(known: Option<&str>, password: &str) -> Result<Looked, password_hash::Error> {
+fn look(
+    known: Option<&str>,
+    password: &str,
+    memory: &mut [Block],
+) -> Result<Looked, password_hash::Error> {
     let written = match known {
         Some(written) => written,
-        None => nobodys()?,
+        None => nobodys(memory)?,
     };
     let parsed = PasswordHash::new(written)?;
+    if let Some(salt) = parsed.salt.filter(|_| is_todays(&parsed)) {
+        let computed = compute(password, salt, memory)?;
+        // Compared in constant time.
+        let is_right = known.is_some() && parsed.hash == Some(computed);
+        return Ok(if is_right {
+            Looked::Right
+        } else {
+            Looked::Wrong
+        });
+    }
     match argon2()?.verify_password(password.as_bytes(), &parsed) {
-        Ok(()) if known.is_none() => Ok(Looked::Wrong),
-        Ok(()) if is_todays(&parsed) => Ok(Looked::Right),
-        Ok(()) => hash(password).map(Looked::Rehashed),
+        Ok(()) => hash(password, memory).map(Looked::Rehashed),
         Err(password_hash::Error::Password) => Ok(Looked::Wrong),
         Err(error) => Err(error),
     }
 }
 
-impl Passwords {
-    async fn work<T: Send + 'static>(
-        &self,
-        before: impl FnOnce() -> Result<(), Error> + Send,
-        work: impl FnOnce() -> Result<T, password_hash::Error> + Send + 'static,
-    ) -> Result<T, Error> {
-        let room = Arc::clone(&self.room);
-        let Ok(place) = room.try_acquire_owned() else {
-            return Err(Error::SignInBusy);
-        };
-        let turn = Arc::clone(&self.working).acquire_owned().await;
-        before()?;
-        // Whoever does not wait for it any more does not make room for another before it has ended.
-        let worked = tokio::task::spawn_blocking(move || {
-            let held = (place, turn);
-            let worked = work();
-            drop(held);
-            worked
-        });
-        match worked.await {
-            Ok(Ok(worked)) => Ok(worked),
-            Ok(Err(error)) => {
-                tracing::error!("a password could not be hashed, or its hash not be read: {error}");
-                Err(Error::Internal("hashing a password"))
-            }
-            Err(_) => Err(Error::Internal("hashing a password")),
+/// Works where nothing waits for it.
+async fn work<T: Send + 'static>(
+    turn: Turn,
+    held: Option<Held>,
+    work: impl FnOnce(&mut [Block]) -> Result<T, password_hash::Error> + Send + 'static,
+) -> Result<T, Error> {
+    let worked = tokio::task::spawn_blocking(move || {
+        let blocks = argon2()?.params().block_count();
+        let worked = turn.work(blocks, work);
+        drop(held);
+        worked
+    });
+    match worked.await {
+        Ok(Ok(worked)) => Ok(worked),
+        Ok(Err(error)) => {
+            tracing::error!("a password could not be hashed, or its hash not be read: {error}");
+            Err(Error::Internal("hashing a password"))
         }
+        Err(_) => Err(Error::Internal("hashing a password")),
     }
+}
 
+impl Passwords {
     /// The hash of a new password.
     pub async fn hash(&self, password: String) -> Result<String, Error> {
-        self.work(|| Ok(()), move || hash(&password)).await
+        let turn = self.accounts.turn().await?;
+        work(turn, None, move |memory| hash(&password, memory)).await
     }
 
     /// Looks whether a password is that of a hash. Without one it takes as long and is wrong. `before` is asked when it is about to
     /// be looked at.
     pub async fn look(
         &self,
-        known: Option<String>,
-        password: String,
+        attempt: Attempt,
         before: impl FnOnce() -> Result<(), Error> + Send,
     ) -> Result<Looked, Error> {
-        self.work(before, move || look(known.as_deref(), &password))
-            .await
+        let held = self.holders.hold(attempt.from, &attempt.name)?;
+        let lane = match attempt.known {
+            Some(_) => &self.accounts,
+            None => &self.made_up,
+        };
+        let turn = lane.turn().await?;
+        before()?;
+        let Attempt {
+            known, password, ..
+        } = attempt;
+        let looking = move |memory: &mut [Block]| look(known.as_deref(), &password, memory);
+        work(turn, Some(held), looking).await
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const GOOD: &str = "four quiet purple engines";
-
-    #[test]
-    fn a_password_is_looked_at_by_its_hash_alone() {
-        let written = hash(GOOD).expect("hashed");
-        assert!(
-            written.starts_with("$argon2id$v=19$m=19456,t=2,p=1$"),
-            "{written}"
-        );
-        assert_ne!(written, hash(GOOD).expect("hashed"), "salted");
-        assert_eq!(look(Some(&written), GOOD), Ok(Looked::Right));
-        assert_eq!(
-            look(Some(&written), "four quiet purple engine"),
-            Ok(Looked::Wrong)
-        );
-        assert_eq!(look(None, GOOD), Ok(Looked::Wrong));
-        look(Some("no hash"), GOOD).expect_err("damaged");
-    }
-
-    #[test]
-    fn a_hash_of_other_parameters_is_made_anew() {
-        let params = Params::new(8, 1, 1, None).expect("parameters");
-        let salt = SaltString::generate(&mut OsRng);
-        let weak = Argon2::new(Algorithm::Argon2id, Version::V0x13, params);
-        let weak = weak
-            .hash_password(GOOD.as_bytes(), &salt)
-            .expect("hashed")
-            .to_string();
-        let Ok(Looked::Rehashed(better)) = look(Some(&weak), GOOD) else {
-            panic!("kept");
-        };
-        assert_eq!(look(Some(&better), GOOD), Ok(Looked::Right));
-        assert_eq!(look(Some(&weak), "another one, wrong"), Ok(Looked::Wrong));
-    }
-
-    #[test]
-    fn passwords_that_are_guessed_first_are_refused() {
-        check("alice", GOOD).expect("a good one");
-        check("al", "ägyptisches öl").expect("characters are counted, not bytes");
-        for (name, password, words) in [
-            ("alice", "short", "at least 12"),
-            ("alice", "", "at least 12"),
-            ("alice", &*"x".repeat(LONGEST + 1), "at most"),
-            ("alice", "aaaaaaaaaaaaaaa", "first that are guessed"),
-            ("alice", "PasswordPassword", "first that are guessed"),
-            ("administrator1", "Administrator1", "first that are guessed"),
-            ("alice", "alicealice123", "first that are guessed"),
-        ] {
-            let refused = check(name, password).expect_err(password);
-            assert!(refused.contains(words), "{password}: {refused}");
-        }
-    }
-
-    #[tokio::test]
-    async fn more_than_may_wait_are_refused() {
-        let passwords = Passwords::default();
-        let all = (AT_ONCE + WAITING) as u32;
-        let taken = Arc::clone(&passwords.room)
-            .acquire_many_owned(all)
-            .await
-            .expect("open");
-        let refused = passwords
-            .hash(GOOD.into())
-            .await
-            .expect_err("no room")
-            .problem();
-        assert_eq!((refused.status, refused.retry_after.is_some()), (503, true));
-        drop(taken);
-        passwords.hash(GOOD.into()).await.expect("room again");
-    }
-
-    #[tokio::test]
-    async fn what_is_refused_before_is_not_looked_at() {
-        let passwords = Passwords::default();
-        let refused = passwords
-            .look(None, GOOD.into(), || Err(Error::Internal("test")))
-            .await;
-        refused.expect_err("refused");
-        assert_eq!(passwords.room.available_permits(), AT_ONCE + WAITING);
-    }
-}
+mod tests;

@@ -16,6 +16,17 @@ pub(super) const SECRET: usize = 52;
 /// Names of principals that are known without a token.
 pub(super) const RESERVED: [&str; 3] = ["local", "root", "configured"];
 
+/// What somebody is that is given a name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Named<'a> {
+    Account,
+    Token {
+        /// The robot whose it is, if it is a robot's.
+        robot: Option<&'a str>,
+    },
+    Pairing,
+}
+
 impl Principals {
     /// Reads the database again, and tells whoever follows.
     pub(super) fn reload(&self) -> Result<(), store::Error> {
@@ -70,13 +81,41 @@ impl Principals {
         }
     }
 
+    /// Refuses a name that somebody of another kind has: rules and records know all of them by their names. A robot's token may have
+    /// the robot's name.
+    pub(super) fn check_name_is_free(&self, name: &str, of: Named<'_>) -> Result<(), Error> {
+        if of != Named::Account && self.has_account(name) {
+            return Err(Error::AccountExists(name.to_owned()));
+        }
+        let is_robots = |robot: Option<&str>| robot == Some(name);
+        let is_others = match of {
+            Named::Account => true,
+            Named::Token { robot } => !is_robots(robot),
+            Named::Pairing => false,
+        };
+        if is_others && self.pairings()?.iter().any(|pairing| pairing.robot == name) {
+            return Err(Error::PairingExists(name.to_owned()));
+        }
+        let stored = self.stored.read();
+        let mut live = stored.tokens.iter().filter(|known| known.revoked.is_none());
+        let token = live.find(|known| known.principal.name == name);
+        let is_others = token.is_some_and(|token| match of {
+            Named::Account => true,
+            // Whether there is one already is seen when it is made.
+            Named::Token { .. } => false,
+            Named::Pairing => !is_robots(token.principal.scope.robot.as_deref()),
+        });
+        if is_others {
+            return Err(Error::TokenExists(name.to_owned()));
+        }
+        Ok(())
+    }
+
     /// Makes a token; its secret is told once.
     pub fn create(&self, new: &api::access::NewToken) -> Result<api::access::Secret, Error> {
         check(new).map_err(Error::BadRequest)?;
-        // Rules and records know both by their names.
-        if self.accounts().iter().any(|known| known.name == new.name) {
-            return Err(Error::AccountExists(new.name.clone()));
-        }
+        let robot = new.robot.as_deref();
+        self.check_name_is_free(&new.name, Named::Token { robot })?;
         let end = |seconds: u64| {
             let end = seconds
                 .checked_mul(1000)

@@ -13,7 +13,7 @@ use authority::{Authority, Issued, Request, Shown as Certificate};
 use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
-use super::changing::RESERVED;
+use super::changing::{Named, RESERVED};
 use super::stored::{StoredScope, damaged};
 use super::{Identity, Principals, Recognising, Shown, Stored, USED, Unrecognised};
 use crate::errors::Error;
@@ -275,6 +275,7 @@ impl Principals {
     /// Makes a code for a robot, in place of one that it has: the code, and its end.
     pub fn begin_pairing(&self, new: &NewPairing) -> Result<(String, Millis), Error> {
         check(new).map_err(Error::BadRequest)?;
+        self.check_name_is_free(&new.robot, Named::Pairing)?;
         let seconds = new.lifetime.unwrap_or(CODE);
         let expires = store::now() + seconds * 1000;
         let code = names::random(::tls::CODE);
@@ -287,6 +288,7 @@ impl Principals {
     /// Pairs a robot that has certificates of the lab's own authority.
     pub fn pair_own(&self, new: &NewPairing) -> Result<(), Error> {
         check(new).map_err(Error::BadRequest)?;
+        self.check_name_is_free(&new.robot, Named::Pairing)?;
         self.state.add_pairing(&new.robot, &self.scope_of(new)?)?;
         self.state.bind_robot(&new.robot, &owner(&new.robot))?;
         Ok(self.reload()?)

@@ -10,7 +10,7 @@ use api::people::{Account, AccountChange, NewAccount, SessionLine};
 use catalogue::names;
 use store::{AccountEdit, AccountRecord, NewSession, Owner, SessionRecord};
 
-use super::changing::{RESERVED, SECRET};
+use super::changing::{Named, RESERVED, SECRET};
 use super::stored::{StoredScope, damaged, read_principal};
 use super::{Identity, Principals, Shown, Unrecognised};
 use crate::errors::Error;
@@ -162,6 +162,13 @@ impl Principals {
         stored.accounts.iter().any(KnownAccount::is_live)
     }
 
+    /// Whether there is an account of that name.
+    pub(super) fn has_account(&self, name: &str) -> bool {
+        let stored = self.stored.read();
+        let mut live = stored.accounts.iter().filter(|known| known.is_live());
+        live.any(|known| known.record.name == name)
+    }
+
     /// All accounts that there are.
     pub fn accounts(&self) -> Vec<Account> {
         let stored = self.stored.read();
@@ -310,12 +317,7 @@ impl Principals {
             )));
         }
         check_role(new.role, &new.services).map_err(Error::BadRequest)?;
-        // Rules and records know both by their names.
-        let mut tokens = self.tokens().into_iter();
-        match tokens.any(|token| token.name == new.name && token.revoked.is_none()) {
-            true => Err(Error::TokenExists(new.name.clone())),
-            false => Ok(()),
-        }
+        self.check_name_is_free(&new.name, Named::Account)
     }
 
     /// Makes an account, by its password's hash.

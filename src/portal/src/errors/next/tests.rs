@@ -76,6 +76,7 @@ fn own() -> Vec<Error> {
         Error::NoProvider,
         oidc::Error::Busy.into(),
         Error::NoRole { who: x(), has: x() },
+        Error::PairingExists(x()),
         Error::SignInBusy,
         Error::TooManyStreams { most: 1 },
         Error::TooManyLook {

@@ -334,3 +334,54 @@ fn pairings_are_kept() {
     assert_eq!(principals.pairings().expect("listed"), before);
     assert_eq!((before.len(), &*before[0].robot), (1, "r1"));
 }
+
+#[test]
+fn a_robot_that_is_paired_shares_its_name_with_nobody_but_its_own_token() {
+    let world = world();
+    let principals = &world.principals;
+    let account = |name: &str| {
+        let new = api::people::NewAccount {
+            name: name.into(),
+            password: "four quiet purple engines".into(),
+            role: Role::Admin,
+            services: Vec::new(),
+        };
+        principals.create_account(&new, "hash")
+    };
+    let token = |name: &str, robot: Option<&str>| {
+        let new = api::access::NewToken {
+            name: name.into(),
+            role: if robot.is_some() {
+                Role::Robot
+            } else {
+                Role::Viewer
+            },
+            services: vec!["det*".parse().expect("a pattern")],
+            robot: robot.map(str::to_owned),
+            classes: Vec::new(),
+            lifetime: None,
+        };
+        principals.create(&new).map(|_| ())
+    };
+    let status = |refused: Result<(), Error>| refused.expect_err("taken").problem().status;
+    let pair = |robot: &str| principals.begin_pairing(&new(robot)).map(|_| ());
+    account("ann").expect("made");
+    token("tool", None).expect("made");
+    token("arm", Some("r9")).expect("made");
+    for taken in ["ann", "tool", "arm"] {
+        assert_eq!(status(pair(taken)), 409, "{taken}");
+        assert_eq!(status(principals.pair_own(&new(taken))), 409, "{taken}");
+    }
+    // Its code waits, and then it is paired.
+    pair("r1").expect("free");
+    principals.pair_own(&new("r2")).expect("free");
+    for taken in ["r1", "r2"] {
+        assert_eq!(status(account(taken)), 409, "{taken}");
+        assert_eq!(status(token(taken, None)), 409, "{taken}");
+        assert_eq!(status(token(taken, Some("r9"))), 409, "{taken}");
+        token(taken, Some(taken)).expect("the same robot's");
+        pair(taken).expect("again");
+    }
+    principals.revoke("tool").expect("there");
+    pair("tool").expect("free by now");
+}

@@ -300,6 +300,27 @@ fn guesses_at_an_account_are_slowed_wherever_they_come_from() {
 }
 
 #[test]
+fn names_that_nobody_has_make_nothing_of_an_accounts_forgotten_and_slow_no_other() {
+    let world = world().with_alice();
+    let from = |number: u32| std::net::IpAddr::from((0x0a00_0000 + number).to_be_bytes());
+    for number in 0..access::guesses::FREE {
+        let principals = &world.principals;
+        principals.wrong_password("alice", from(number), 5_000);
+    }
+    for number in 0..access::guesses::REMEMBERED as u32 + 100 {
+        let name = format!("nobody{number}");
+        let principals = &world.principals;
+        principals.wrong_password(&name, from(1_000 + number), 5_001);
+    }
+    let slowed = world.principals.may_try("alice", from(99_999), 5_001);
+    assert_eq!(slowed, Err(Unrecognised::SlowedSignIn(999)));
+    for other in ["bob", "nobody-new"] {
+        let tried = world.principals.may_try(other, from(99_999), 5_001);
+        tried.expect("it was not tried before");
+    }
+}
+
+#[test]
 fn a_person_has_so_many_sessions_and_no_more() {
     let world = world().with_alice();
     let first = world.begin();
