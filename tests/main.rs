@@ -523,6 +523,7 @@ fn main() -> ExitCode {
         ],
         stories![untrusted:
             who_dribbles_an_upgrade_is_let_go,
+            connections_that_say_nothing_keep_nobody_out,
             rubbish_instead_of_an_upgrade_is_refused,
             two_sockets_of_one_robot_share_its_servant,
             nobody_takes_over_anothers_robot,

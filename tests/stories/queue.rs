@@ -1,12 +1,14 @@
 //! Robots before a machine that is full: who goes first, and what each is told.
 
 use std::io::{Read, Write};
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
+use support::deployer::run;
 use support::patience::{connect, scale_seconds};
 use support::world::{GREETER, world};
 
@@ -76,6 +78,13 @@ pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdi
     first.leaves()?;
     let mut fifth = daemon.robot("greeter_cpp?robot=fifth")?;
     fifth.calls("/rosapi/get_time", json!({}))?;
+    // Names of robots for which there never was room are bound to nobody.
+    let script = format!(
+        "import sqlite3\nfor name, in sqlite3.connect({:?}).execute('SELECT name FROM robots ORDER BY name'): print(name)",
+        daemon.home.join("cloudroid.db")
+    );
+    let kept = run(Command::new("python3").args(["-c", &script]))?.succeeded()?;
+    ensure!(kept.stdout == "fifth\nfirst\n", "{}", kept.stdout);
     Ok(())
 }
 

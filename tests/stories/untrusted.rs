@@ -4,6 +4,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 
 use anyhow::{Context, ensure};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use serde_json::json;
 use support::Verdict;
 use support::patience::{Deadline, connect};
@@ -53,6 +54,55 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
         }
     }
     ensure!(daemon.get("/healthz")?.0 == 200);
+    Ok(())
+}
+
+pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
+    let daemon = world().own("crowded").start()?;
+    // As many descriptors as may be, whatever the shell gave.
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", daemon.pid()))?;
+    let line = limits
+        .lines()
+        .find(|line| line.starts_with("Max open files"));
+    let mut numbers = line.context("a limit")?.split_whitespace().skip(3);
+    let (soft, hard) = (numbers.next(), numbers.next());
+    ensure!(
+        soft == hard || soft == Some("524288"),
+        "{soft:?} of {hard:?}"
+    );
+    let (_, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
+    setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
+    let silent: Vec<TcpStream> = (0..1_100)
+        .map(|_| TcpStream::connect(&daemon.address))
+        .collect::<Result<_, _>>()?;
+    ensure!(daemon.get("/healthz")?.0 == 200, "others are answered");
+    let (_, told) = daemon.get("/metrics")?;
+    let value = |name: &str| {
+        let mut rows = told.lines().filter_map(|row| row.strip_prefix(name));
+        rows.find_map(|row| row.trim().parse::<f64>().ok())
+            .context(name.to_owned())
+    };
+    let (dropped, kept) = (
+        value("cloudroid_dropped_strangers_total")?,
+        value("cloudroid_strangers")?,
+    );
+    ensure!(
+        dropped >= 70.0 && kept <= 1024.0,
+        "{dropped} dropped, {kept} kept"
+    );
+    drop(silent);
+    // A header is read again with each part of it that comes.
+    for (length, status) in [(60_000, "HTTP/1.1 200"), (70_000, "HTTP/1.1 431")] {
+        let mut connection = connect(&daemon.address)?;
+        connection
+            .write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nX: ")?;
+        // Who is refused before the end is read no further.
+        let _ = connection.write_all(&vec![b'x'; length]);
+        let _ = connection.write_all(b"\r\n\r\n");
+        let mut answer = String::new();
+        let _ = connection.read_to_string(&mut answer);
+        ensure!(answer.starts_with(status), "{length} bytes: {answer:?}");
+    }
     Ok(())
 }
 

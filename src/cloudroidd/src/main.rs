@@ -163,6 +163,9 @@ fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
 
 /// Everything that can be refused without having changed anything but the state directory.
 fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
+    if let Err(error) = machine::raise_descriptors() {
+        tracing::warn!("the number of open files cannot be raised: {error}");
+    }
     let mut config = Config::read(arguments.config.as_deref())?;
     config.listen = arguments.listen.unwrap_or(config.listen);
     config.check()?;

@@ -89,7 +89,7 @@ pub fn build(
         passwords: Passwords::default(),
         provider,
         audit: Audit::new(Arc::clone(&state)),
-        handshakes: Arc::default(),
+        strangers: Arc::new(portal::Strangers::new(machine::descriptors())),
         listen,
         tls: certificates::tls(&config.tls, home, listen, robots.as_ref())?,
         robots,

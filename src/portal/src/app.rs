@@ -12,13 +12,13 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
-use crate::handshakes::Handshakes;
 use crate::inside::Lookers;
 use crate::observers::{BlackBoxOptions, Observers};
 use crate::people::passwords::Passwords;
 use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
+use crate::strangers::Strangers;
 use crate::stream::Live;
 use crate::tls::Tls;
 
@@ -66,8 +66,8 @@ pub struct App {
     pub provider: Option<IdentityProvider>,
     /// What was done.
     pub audit: Audit,
-    /// Handshakes of TLS that are under way.
-    pub handshakes: Arc<Handshakes>,
+    /// Connections on which nobody has shown yet who asks.
+    pub strangers: Arc<Strangers>,
     /// Where the portal listens, as bound.
     pub listen: std::net::SocketAddr,
     /// TLS of the TCP listener; none: plain text.

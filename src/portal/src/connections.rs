@@ -20,10 +20,12 @@ use crate::app::App;
 use crate::guard::{self, Caller, Connection, Peer, User};
 use crate::peer_groups;
 use crate::principals::Shown;
-use crate::tls::{self, Accepted};
+use crate::tls::{self, Accepted, Tls};
 
 /// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+/// Bytes of a request's header. What has come of it is read again with each part that comes.
+const LONGEST_HEADER: usize = 64 << 10;
 /// Bytes that the kernel takes for a connection beyond those that are on their way.
 const UNSENT: u32 = 128 * 1024;
 
@@ -38,11 +40,22 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
         match accepted {
             Ok((stream, address)) => {
                 tune(&stream);
-                let peer = Peer::Tcp(address);
-                connections.spawn(secured(Arc::clone(&app), router.clone(), stream, peer));
+                let stranger = app.strangers.enter(&app.options.proxies, address.ip());
+                let connection = Connection {
+                    stranger: Some(Arc::new(stranger)),
+                    ..Connection::plain(Peer::Tcp(address))
+                };
+                connections.spawn(secured(
+                    Arc::clone(&app),
+                    router.clone(),
+                    stream,
+                    connection,
+                ));
             }
             Err(error) => {
                 tracing::warn!("no connection can be accepted: {error}");
+                // It may be for want of a descriptor.
+                app.strangers.make_room();
                 tokio::time::sleep(ACCEPT_AGAIN).await;
             }
         }
@@ -59,14 +72,14 @@ pub async fn serve_challenges(app: Arc<App>, listener: TcpListener) {
             tokio::time::sleep(ACCEPT_AGAIN).await;
             continue;
         };
-        let Some(begun) = app.handshakes.begin(&app.options.proxies, address.ip()) else {
-            continue;
-        };
+        let stranger = app.strangers.enter(&app.options.proxies, address.ip());
         let (tls, time) = (Arc::clone(tls), app.options.handshake);
         connections.spawn(async move {
-            let _begun = begun;
-            // Whoever did not come for it is let go.
-            let _ = tokio::time::timeout(time, tls.accept(stream)).await;
+            tokio::select! {
+                // Whoever did not come for it is let go.
+                _ = tokio::time::timeout(time, tls.accept(stream)) => {}
+                () = stranger.dropped() => {}
+            }
         });
     }
     drain(&app, connections).await;
@@ -120,36 +133,52 @@ async fn drain(app: &App, connections: TaskTracker) {
     let _ = tokio::time::timeout(app.options.drain, connections.wait()).await;
 }
 
-/// Serves a TCP connection, through TLS where the portal speaks it.
-async fn secured(app: Arc<App>, router: Router, stream: TcpStream, peer: Peer) {
-    let Some(tls) = &app.tls else {
-        return serve(app, router, stream, Connection::plain(peer)).await;
+/// Serves a TCP connection, through TLS where the portal speaks it, until it ends or newer ones need its place.
+async fn secured(app: Arc<App>, router: Router, stream: TcpStream, connection: Connection) {
+    let peer = connection.peer;
+    let place = connection.clone();
+    let served = async {
+        match &app.tls {
+            Some(tls) => serve_tls(&app, tls, router, stream, connection).await,
+            None => serve(Arc::clone(&app), router, stream, connection).await,
+        }
     };
-    let Some(begun) = app.handshakes.begin(&app.options.proxies, peer.ip()) else {
-        tracing::debug!("no TLS with {peer}: too many handshakes are under way");
-        return;
-    };
+    tokio::select! {
+        () = served => {}
+        () = place.dropped() => {
+            tracing::debug!("dropped {peer}: it has not shown who asks, and newer ones need its place");
+        }
+    }
+}
+
+async fn serve_tls(
+    app: &Arc<App>,
+    tls: &Tls,
+    router: Router,
+    stream: TcpStream,
+    connection: Connection,
+) {
+    let peer = connection.peer;
     let accepted = tokio::select! {
         accepted = tokio::time::timeout(app.options.handshake, tls.accept(stream)) => accepted,
         () = app.ending.cancelled() => return,
     };
-    drop(begun);
     match accepted {
         Ok(Ok(Accepted::Tls(stream))) => {
             let connection = Connection {
                 secure: true,
                 certificates: tls::certificates(&stream),
-                ..Connection::plain(peer)
+                ..connection
             };
-            let ended = unpaired(&app, &connection);
+            let ended = unpaired(app, &connection);
             tokio::select! {
                 // A connection that became a WebSocket goes on in its session, which is told the same.
                 () = ended => {}
-                () = serve(Arc::clone(&app), router, *stream, connection) => {}
+                () = serve(Arc::clone(app), router, *stream, connection) => {}
             }
         }
         Ok(Ok(Accepted::Plain(stream))) => {
-            serve(app, tls::refusing(), stream, Connection::plain(peer)).await;
+            serve(Arc::clone(app), tls::refusing(), stream, connection).await;
         }
         Ok(Ok(Accepted::Challenge)) => {
             tracing::debug!("{peer} has seen the answer to a challenge");
@@ -157,11 +186,7 @@ async fn secured(app: Arc<App>, router: Router, stream: TcpStream, peer: Peer) {
         Ok(Err(error)) => {
             tracing::debug!("no TLS with {peer}: {error}");
             if let Some(refused) = tls::refused_certificate(&error) {
-                let nobody = Caller::new(
-                    &Connection::plain(peer),
-                    Principal::nobody(),
-                    Shown::Nothing,
-                );
+                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
                 let did = format!("showed a certificate that was refused: {refused}");
                 let status = axum::http::StatusCode::UNAUTHORIZED.as_u16();
                 app.audit
@@ -205,6 +230,7 @@ async fn serve(
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(app.options.handshake)
+        .max_header_size(LONGEST_HEADER)
         .serve_connection(TokioIo::new(stream), service)
         .with_upgrades();
     tokio::pin!(served);

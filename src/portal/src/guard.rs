@@ -89,6 +89,9 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     });
     match admitted {
         Ok(caller) => {
+            if caller.who.shown != Shown::Nothing {
+                connection.admit();
+            }
             app.principals.note_use(&caller.who, store::now());
             request.extensions_mut().insert(caller);
             next.run(request).await

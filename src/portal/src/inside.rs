@@ -147,7 +147,7 @@ pub(crate) fn grants(app: &App, caller: &Caller, whose: Whose<'_>) -> Result<Arc
 
 /// Whether a robot's name is nobody's, or the caller's.
 fn is_free(app: &App, caller: &Caller, robot: &str) -> Result<bool, Error> {
-    let owner = app.state.robot_owner(robot, None, false)?;
+    let owner = app.state.owner_of_robot(robot)?;
     Ok(owner.is_none() || owner == caller.who.owner)
 }
 

@@ -13,7 +13,6 @@ use bridge::Metrics;
 
 use crate::app::App;
 use crate::errors::Error;
-use crate::tls::Tls;
 use choreographer::{Choreographer, Handle};
 use exposition::{
     OPEN_METRICS, PROMETHEUS, asks_for_open_metrics, family, gauge, labels, open_metrics,
@@ -73,8 +72,26 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
             (labels(&[("why", "slowed")]), slowed as f64),
         ],
     );
-    if let Some(tls) = &app.tls {
-        transport(&mut out, &app, tls);
+    gauge(
+        &mut out,
+        "cloudroid_strangers",
+        "TCP connections on which nobody has shown yet who asks.",
+        [(String::new(), app.strangers.count() as f64)],
+    );
+    family(
+        &mut out,
+        "cloudroid_dropped_strangers_total",
+        "counter",
+        "TCP connections that were dropped before anybody had shown who asks, because newer ones needed their places.",
+        [(String::new(), app.strangers.dropped() as f64)],
+    );
+    if let Some(end) = app.tls.as_ref().and_then(|tls| tls.end()) {
+        gauge(
+            &mut out,
+            "cloudroid_certificate_end_seconds",
+            "When the portal's certificate ends, in seconds since 1970.",
+            [(String::new(), end as f64 / 1000.0)],
+        );
     }
     capacity(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
@@ -226,25 +243,6 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
             .iter()
             .map(|(of, all)| ((*of).clone(), all[at].2 as f64));
         family(out, name, "counter", help, rows);
-    }
-}
-
-/// TLS.
-fn transport(out: &mut String, app: &App, tls: &Tls) {
-    family(
-        out,
-        "cloudroid_refused_handshakes_total",
-        "counter",
-        "Handshakes of TLS that were not begun because too many were under way.",
-        [(String::new(), app.handshakes.refused() as f64)],
-    );
-    if let Some(end) = tls.end() {
-        gauge(
-            out,
-            "cloudroid_certificate_end_seconds",
-            "When the portal's certificate ends, in seconds since 1970.",
-            [(String::new(), end as f64 / 1000.0)],
-        );
     }
 }
 

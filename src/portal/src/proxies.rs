@@ -176,6 +176,7 @@ impl Proxies {
             forwarded: true,
             // What the proxy shows is the proxy's.
             certificates: Arc::default(),
+            stranger: connection.stranger.clone(),
         })
     }
 

@@ -23,20 +23,27 @@ use tokio::net::{TcpStream, UnixStream};
 use tokio::sync::{mpsc, watch};
 use tokio_rustls::server::TlsStream;
 
-use super::guard::{self, Caller, Peer};
+use super::guard::{self, Caller, Connection, Peer};
 use super::{App, allowed, auth, handshake, page};
 use crate::errors::Error;
+use crate::principals::Identity;
 use crate::tokens::{self, AuthMessage};
 use choreographer::{Lease, ServantRequest};
+use store::Owner;
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
 /// Close code for a policy that was violated.
 const POLICY: u16 = 1008;
+/// Why a client is sent away of whom nobody knows yet who it is.
+const CROWDED: &str = "too many connect and do not say who they are; send the auth message sooner, or a token in the address";
 /// Bytes that a robot's stub may send before its servant is there.
 const STUB_AHEAD: usize = 64 * 1024;
 /// Words about where a robot stands that may wait to be sent.
 const NEWS: usize = 4;
+/// Characters by which a robot is called that gave no name, which are shown: so many that nobody finds a resume token with the same ones
+/// (128 bits of a hash).
+const NAMELESS: usize = 32;
 /// Bytes of a node's name.
 const LONGEST_NODE: usize = 256;
 
@@ -190,6 +197,11 @@ impl RobotRequest {
         }
     }
 
+    /// The robot's name, where it is its own.
+    fn own_name(&self) -> Option<&str> {
+        self.robot.as_deref().filter(|_| !self.shared)
+    }
+
     /// The resume token, bound to the caller.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
@@ -226,6 +238,7 @@ async fn connect(
         let lease = lease(&app, &asked, &caller)?;
         if asked.link {
             lease.admitted().await?;
+            claim(&app, &asked, &caller)?;
         }
         Some(lease)
     } else {
@@ -241,9 +254,16 @@ async fn connect(
         false => rosbridge_protocol(request.headers())?,
     };
     let sessions = app.sessions.clone();
+    let connection = request.extensions_mut().remove::<Connection>();
+    if let (Some(connection), Some(_)) = (&connection, &lease) {
+        connection.admit();
+    }
     sessions.spawn(async move {
         match upgrade.await {
-            Ok(upgraded) => upgraded_to(app, asked, caller, lease, upgraded).await,
+            Ok(upgraded) => {
+                let (io, read_ahead) = unwrapped(upgraded);
+                session(app, asked, caller, lease, connection, io, read_ahead).await;
+            }
             Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
         }
     });
@@ -332,8 +352,8 @@ fn check(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> 
         });
     }
     allowed::known_to(app, caller, &asked.service)?;
-    match asked.robot.as_deref().filter(|_| !asked.shared) {
-        Some(robot) => check_owner(app, robot, caller),
+    match asked.own_name() {
+        Some(robot) => check_owner(robot, app.state.owner_of_robot(robot)?, caller),
         None => Ok(()),
     }
 }
@@ -360,13 +380,20 @@ fn note(app: &Arc<App>, asked: &RobotRequest, caller: &Caller, allowed: &Result<
     });
 }
 
-/// Nobody takes over another's robot.
-fn check_owner(app: &App, robot: &str, caller: &Caller) -> Result<(), Error> {
+/// Binds the robot's name to whoever uses it first. Not before there is room for it: who is refused leaves nothing behind.
+fn claim(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
+    let Some(robot) = asked.own_name() else {
+        return Ok(());
+    };
     // Where tokens are configured, a name used before there were any goes to the first who has one.
     let claim = !app.principals.names_nobody();
-    let owner = app
-        .state
-        .robot_owner(robot, caller.who.owner.as_ref(), claim)?;
+    let own = caller.who.owner.as_ref();
+    let owner = app.state.robot_owner(robot, own, claim)?;
+    check_owner(robot, owner, caller)
+}
+
+/// Nobody takes over another's robot.
+fn check_owner(robot: &str, owner: Option<Owner>, caller: &Caller) -> Result<(), Error> {
     if owner.is_some() && owner != caller.who.owner {
         return Err(Error::RobotTaken(robot.to_owned()));
     }
@@ -377,20 +404,9 @@ fn check_owner(app: &App, robot: &str, caller: &Caller) -> Result<(), Error> {
 /// back under it: who holds the resume token, here bound to who shows it, can.
 fn nameless(resume: Option<&str>) -> (String, bool) {
     match resume {
-        Some(bound) => (format!("~{}", &bound[..12]), false),
-        None => (format!("~{}", names::random(6)), true),
+        Some(bound) => (format!("~{}", &bound[..NAMELESS]), false),
+        None => (format!("~{}", names::random(NAMELESS)), true),
     }
-}
-
-async fn upgraded_to(
-    app: Arc<App>,
-    asked: RobotRequest,
-    caller: Caller,
-    lease: Option<Lease>,
-    upgraded: Upgraded,
-) {
-    let (io, read_ahead) = unwrapped(upgraded);
-    session(app, asked, caller, lease, io, read_ahead).await
 }
 
 /// A connection behind its upgrade, and what was already read from it. Without hyper's wrapping around them, reads and writes go
@@ -408,11 +424,36 @@ pub fn unwrapped(upgraded: Upgraded) -> (Stream, bytes::Bytes) {
     }
 }
 
+/// Who sends the first message of a connection, and what was read beyond it; else with which code it is closed, and why.
+async fn recognise(
+    app: &App,
+    caller: &Caller,
+    io: &mut Stream,
+    read_ahead: bytes::Bytes,
+) -> Result<(Identity, bytes::Bytes), (u16, String)> {
+    let from = caller.peer.ip();
+    let recognise = |message: &AuthMessage, now| app.principals.recognise_auth(message, from, now);
+    let awaited = auth::first_message(io, read_ahead, recognise);
+    match tokio::time::timeout(app.options.handshake, awaited).await {
+        Ok(heard) => heard.map_err(|reason| (POLICY, reason)),
+        Err(_) => Err((POLICY, "no auth message came; send a token".to_owned())),
+    }
+}
+
+/// Comes back when newer connections of strangers need the place of this one.
+async fn dropped(connection: Option<&Connection>) {
+    match connection {
+        Some(connection) => connection.dropped().await,
+        None => std::future::pending().await,
+    }
+}
+
 async fn session(
     app: Arc<App>,
     mut asked: RobotRequest,
     mut caller: Caller,
     lease: Option<Lease>,
+    connection: Option<Connection>,
     mut io: Stream,
     mut read_ahead: bytes::Bytes,
 ) {
@@ -420,20 +461,21 @@ async fn session(
         return linked(&app, &asked, &caller, lease, io, read_ahead).await;
     }
     if lease.is_none() {
-        let from = caller.peer.ip();
-        let recognise =
-            |message: &AuthMessage, now| app.principals.recognise_auth(message, from, now);
-        let awaited = auth::first_message(&mut io, read_ahead, recognise);
-        match tokio::time::timeout(app.options.handshake, awaited).await {
-            Ok(Ok((who, rest))) => {
+        let awaited = recognise(&app, &caller, &mut io, read_ahead);
+        let recognised = tokio::select! {
+            recognised = awaited => recognised,
+            () = dropped(connection.as_ref()) => Err((TRY_AGAIN_LATER, CROWDED.to_owned())),
+        };
+        match recognised {
+            Ok((who, rest)) => {
                 read_ahead = rest;
                 caller.who = who;
             }
-            Ok(Err(reason)) => return bridge::refuse(io, POLICY, &reason).await,
-            Err(_) => {
-                return bridge::refuse(io, POLICY, "no auth message came; send a token").await;
-            }
+            Err((code, reason)) => return bridge::refuse(io, code, &reason).await,
         }
+    }
+    if let Some(connection) = connection {
+        connection.admit();
     }
     let allowed = asked
         .by(&caller)
@@ -537,6 +579,7 @@ async fn servant(
         None => self::lease(app, asked, caller)?,
     };
     admitted(&lease, news).await?;
+    claim(app, asked, caller)?;
     let reach = lease.ready().await?;
     Ok((lease, reach))
 }
@@ -662,5 +705,8 @@ mod tests {
             names::robot(&named("secret").0).is_err(),
             "no robot can claim it"
         );
+        for name in [named("secret").0, nameless(None).0] {
+            assert!(name.len() > 32, "{name} can be found");
+        }
     }
 }

@@ -21,12 +21,7 @@ impl State {
         claim: bool,
     ) -> Result<Option<Owner>, Error> {
         // Who is known comes in even while nothing can be written.
-        let known: Option<Option<Owner>> = self.read(|connection| {
-            connection
-                .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
-                .query_row([robot], |row| row.get(0))
-                .optional()
-        })?;
+        let known = self.known_robot(robot)?;
         if let Some(known) = known
             && (known.is_some() || !claim)
         {
@@ -64,6 +59,21 @@ impl State {
                 "DELETE FROM robots WHERE owner IS NOT NULL AND owner NOT IN (SELECT value FROM json_each(?1))",
                 [kept],
             )
+        })
+    }
+
+    /// To whom a robot's name is bound, if to anybody. Nothing is written.
+    pub fn owner_of_robot(&self, robot: &str) -> Result<Option<Owner>, Error> {
+        Ok(self.known_robot(robot)?.flatten())
+    }
+
+    /// The row of a robot, if there is one: its owner, if it has one.
+    fn known_robot(&self, robot: &str) -> Result<Option<Option<Owner>>, Error> {
+        self.read(|connection| {
+            connection
+                .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
+                .query_row([robot], |row| row.get(0))
+                .optional()
         })
     }
 

@@ -430,6 +430,7 @@ async fn what_is_told_while_another_has_the_database_is_kept_and_written_later()
 #[test]
 fn a_known_robot_comes_in_while_nothing_can_be_written() {
     let (directory, state) = state();
+    assert_eq!(state.owner_of_robot("r1").expect("readable"), None);
     state.robot_owner("r1", None, false).expect("written");
     let other = Connection::open(directory.path().join("cloudroid.db")).expect("a database");
     other.execute_batch("BEGIN EXCLUSIVE").expect("locked");

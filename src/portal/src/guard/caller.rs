@@ -8,6 +8,7 @@ use access::Principal;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 
 use crate::principals::{Identity, Shown};
+use crate::strangers::Stranger;
 
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,6 +68,8 @@ pub struct Connection {
     pub forwarded: bool,
     /// The certificates that the client has shown in TLS, its own first; none where it showed none.
     pub certificates: Arc<[CertificateDer<'static>]>,
+    /// Its place among those on which nobody has shown who asks; none for users of this machine, who are told apart by the kernel.
+    pub stranger: Option<Arc<Stranger>>,
 }
 
 impl Connection {
@@ -77,6 +80,22 @@ impl Connection {
             secure: matches!(peer, Peer::Unix(_)),
             forwarded: false,
             certificates: Arc::default(),
+            stranger: None,
+        }
+    }
+
+    /// Counts it among strangers no more.
+    pub(crate) fn admit(&self) {
+        if let Some(stranger) = &self.stranger {
+            stranger.admit();
+        }
+    }
+
+    /// Comes back when newer connections of strangers need its place.
+    pub(crate) async fn dropped(&self) {
+        match &self.stranger {
+            Some(stranger) => stranger.dropped().await,
+            None => std::future::pending().await,
         }
     }
 }
