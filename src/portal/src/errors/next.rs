@@ -47,7 +47,7 @@ impl Error {
             }
             Error::SignInBusy => "try again later".into(),
             Error::TooManyStreams { .. } => {
-                "close pages of the portal that are open elsewhere, or end commands that follow something (cloudroidctl logs -f), then try again".into()
+                "close pages of the portal that are open elsewhere, or end commands that follow something (cloudroidctl logs --follow), then try again".into()
             }
             Error::TooManyLook { .. } => {
                 "close pages that look into it elsewhere, then try again".into()
