@@ -26,7 +26,7 @@ const LONGEST: Millis = 60_000;
 /// What an address has guessed is forgotten so long after its last guess.
 const FORGOTTEN: Millis = 600_000;
 /// Addresses and networks, or accounts, that are remembered.
-pub const REMEMBERED: usize = 4_096;
+pub const REMEMBERED: usize = 8_192;
 
 /// What came from one address or network.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

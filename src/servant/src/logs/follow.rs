@@ -47,18 +47,20 @@ pub fn follow(
     let discovering = privilege::now(move || {
         let directory = log.parent().unwrap_or(Path::new("/"));
         let watch = watches.watch(directory)?;
-        let discovery = Discovery::open(&log, start, watch, files)?;
+        let discovery = Discovery::open(&log, start, watch, Arc::clone(&files))?;
+        // Those that are there are read first, however soon there are others.
+        let first = [files.take(), files.take()];
         tokio::spawn(async move {
             discovery.run(&changes, ended).await;
             drop(guard);
         });
-        Ok::<_, io::Error>(())
+        Ok::<_, io::Error>(first)
     });
     match discovering {
-        Ok(()) => {
+        Ok([file, younger]) => {
             let reader = Reader {
-                file: None,
-                younger: None,
+                file,
+                younger,
                 opened,
                 changed,
                 sender,
@@ -201,8 +203,7 @@ impl Reader {
     /// Comes back when the log was read to its end, or nobody receives any more.
     async fn run(mut self, start: LogStart) {
         if let LogStart::Last(count) = start {
-            // The older one comes first, if there is one.
-            let files = self.opened.take().into_iter().chain(self.opened.take());
+            let files = self.file.take().into_iter().chain(self.younger.take());
             let files = files.collect();
             let placed = tokio::task::spawn_blocking(move || seek_to_last(files, count)).await;
             let mut placed = placed.unwrap_or_default().into_iter();
