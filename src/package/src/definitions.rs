@@ -16,8 +16,11 @@ const MAX_BYTES: u64 = 256 << 10;
 /// All definitions together.
 const MAX_TOTAL: usize = 32 << 20;
 const MAX_FILES: usize = 20_000;
+/// Directories of one package, and how deep they are, in which definitions are looked for.
+const MAX_DIRECTORIES: usize = 2000;
+const MAX_DEPTH: usize = 8;
 
-/// Directories of a package and the files in them.
+/// Directories of a package that definitions are usually in, and the files of each kind.
 const KINDS: [(&str, &str); 3] = [("msg", ".msg"), ("srv", ".srv"), ("action", ".action")];
 
 /// Other forms that packages of ROS 2 have interfaces in, some of them nothing else.
@@ -41,7 +44,8 @@ const FORMS: [Form; 2] = [
 ///
 /// `layers` are extracted trees, lowest first. `shares` are paths in them such as `usr/share` and
 /// `opt/ros/noetic/share`; of a package that is in several of them only the definitions in the first count, as ROS
-/// itself finds them. Text that is not UTF-8 (in comments) is replaced. IDL and descriptions of types become texts in the
+/// itself finds them; of several definitions of one type that in `msg`, `srv` or `action`. Text that is not UTF-8 (in
+/// comments) is replaced. IDL and descriptions of types become texts in the
 /// language of `.msg`, where a package has no such file.
 pub fn read<L: AsRef<Path>, S: AsRef<str>>(
     layers: &[L],
@@ -112,6 +116,52 @@ impl Reader {
                         self.definitions.insert(key, text.clone());
                     }
                 }
+            }
+        }
+        let mut left = MAX_DIRECTORIES;
+        self.elsewhere(package, directory, MAX_DEPTH, &mut left)
+    }
+
+    /// Adds what a package of ROS has in other directories, such as `add_service_files(DIRECTORY services)` of ROS 1
+    /// installs it. Large files and directories are data: they are passed over.
+    fn elsewhere(
+        &mut self,
+        package: &str,
+        directory: &Merged,
+        depth: usize,
+        left: &mut usize,
+    ) -> Result<(), Error> {
+        let files = match directory.names() {
+            Err(Error::TooMany { .. }) => return Ok(()),
+            files => files?,
+        };
+        // Beside packages of ROS, `share` has many that are of no ROS and large.
+        if depth == MAX_DEPTH && !files.contains_key(b"package.xml".as_slice()) {
+            return Ok(());
+        }
+        for (kind, extension) in KINDS {
+            for (level, name, of_type) in ending(&files, extension) {
+                let key = format!("{package}/{kind}/{of_type}");
+                if self.definitions.contains_key(&key) {
+                    continue;
+                }
+                let text = match self.file(level, name) {
+                    Err(Error::TooLarge { .. }) => None,
+                    text => text?,
+                };
+                if let Some(text) = text {
+                    self.definitions.insert(key, text);
+                }
+            }
+        }
+        for name in files.keys() {
+            if depth == 0 || *left == 0 {
+                break;
+            }
+            let inside = directory.below(name)?;
+            if inside.exists() {
+                *left -= 1;
+                self.elsewhere(package, &inside, depth - 1, left)?;
             }
         }
         Ok(())
@@ -236,6 +286,34 @@ mod tests {
         let registry =
             ros::schema::Registry::of_definitions(ros::bus::RosVersion::Two, &found).unwrap();
         assert_eq!(registry.message("p/msg/Point").unwrap().fields().len(), 2);
+    }
+
+    #[test]
+    fn definitions_anywhere_in_a_package_are_found() {
+        let layers = Layers::new();
+        layers
+            .write("base/usr/share/p/package.xml", "x")
+            .write("base/usr/share/p/msg/Twice.msg", "int8 canonical")
+            .write("base/usr/share/p/services/Ask.srv", "---")
+            .write("base/usr/share/p/interfaces/deep/Told.msg", "string told")
+            .write("base/usr/share/p/interfaces/deep/Go.action", "---\n---\n")
+            .write("base/usr/share/p/a/Twice.msg", "int8 other")
+            .write("base/usr/share/p/mail/Large.msg", "#".repeat(300 << 10))
+            // Not a package of ROS, whatever it holds.
+            .write("base/usr/share/doc/mails/Letter.msg", "x");
+        for number in 0..=merged::MAX_FILES {
+            layers.write(&format!("base/usr/share/p/data/{number}.png"), "");
+        }
+        let found = layers.read(&["base"]).unwrap();
+        assert_eq!(
+            list(&found),
+            [
+                ("p/action/Go", "---\n---\n"),
+                ("p/msg/Told", "string told"),
+                ("p/msg/Twice", "int8 canonical"),
+                ("p/srv/Ask", "---"),
+            ]
+        );
     }
 
     #[test]

@@ -184,6 +184,9 @@ fn packages(stack: &[Level], prefixes: &[String]) -> Result<BTreeMap<String, Ins
     Ok(packages)
 }
 
+/// What `dynamic_reconfigure` makes code of: executable, and of no use to a node.
+const OF_BUILDS: &str = ".cfg";
+
 /// Names of programs. A link to one is one.
 fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
     let mut found = BTreeSet::new();
@@ -192,6 +195,7 @@ fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
             continue;
         };
         if names::is_executable(&text)
+            && !text.ends_with(OF_BUILDS)
             && (level.is_executable(&name) || level.link(&name).is_some())
         {
             found.insert(text);

@@ -3,6 +3,7 @@
 //! ```text
 //!   directory ──workspace::inspect──▶ Pushed: packages in build order │ an install space
 //!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
+//!   sources ──foreseen──▶ programs and launch files, as far as they show
 //!   layers ──inventory::take──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
 //!   layers, inventory, interface ──stub──▶ the files that a robot installs in the package's place
@@ -14,11 +15,13 @@
 #![forbid(unsafe_code)]
 
 pub mod ament;
+mod cmake;
 pub mod condition;
 pub mod definitions;
 pub mod difference;
 mod error;
 pub mod fits;
+pub mod foreseen;
 mod install_space;
 pub mod interface;
 mod interface_toml;

@@ -276,3 +276,16 @@ fn what_an_earlier_version_recorded_is_read() {
     assert!(read.launch_files.is_empty() && read.components.is_empty());
     assert_eq!(serde_json::to_string(&read).expect("written"), recorded);
 }
+
+#[test]
+fn configurations_of_parameters_are_no_executables() {
+    let layers = layers();
+    layers.file("low/usr/lib/p/DWAPlanner.cfg", 0o755);
+    let taken = layers.take(&[], &[]);
+    let executables: Vec<&str> = taken.packages["p"]
+        .executables
+        .iter()
+        .map(String::as_str)
+        .collect();
+    assert_eq!(executables, ["node"]);
+}

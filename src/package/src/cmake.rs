@@ -1,0 +1,178 @@
+//! Commands of CMake's language, as they are written: nothing is evaluated.
+
+/// A command with its arguments, of which quotes are taken away and variables are left as they are.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Command {
+    /// In lower case, as CMake takes no notice of it.
+    pub(crate) name: String,
+    pub(crate) arguments: Vec<String>,
+}
+
+/// Reads the commands of a file. One that does not end is left out, and so is what follows it.
+pub(crate) fn commands(text: &str) -> Vec<Command> {
+    let mut reader = Reader { rest: text };
+    let mut found = Vec::new();
+    loop {
+        reader.skip_space();
+        let name = reader.take_while(|c| c.is_ascii_alphanumeric() || c == '_');
+        if name.is_empty() {
+            // No file that CMake takes has anything else here.
+            if reader.next().is_none() {
+                return found;
+            }
+            continue;
+        }
+        reader.skip_space();
+        if !reader.skip("(") {
+            continue;
+        }
+        let Some(arguments) = reader.arguments() else {
+            return found;
+        };
+        found.push(Command {
+            name: name.to_ascii_lowercase(),
+            arguments,
+        });
+    }
+}
+
+struct Reader<'a> {
+    rest: &'a str,
+}
+
+impl<'a> Reader<'a> {
+    fn next(&mut self) -> Option<char> {
+        let next = self.rest.chars().next()?;
+        self.rest = &self.rest[next.len_utf8()..];
+        Some(next)
+    }
+
+    fn skip(&mut self, word: &str) -> bool {
+        let rest = self.rest.strip_prefix(word);
+        self.rest = rest.unwrap_or(self.rest);
+        rest.is_some()
+    }
+
+    fn take_while(&mut self, is_part: impl Fn(char) -> bool) -> &'a str {
+        let end = self.rest.find(|c| !is_part(c)).unwrap_or(self.rest.len());
+        let (taken, rest) = self.rest.split_at(end);
+        self.rest = rest;
+        taken
+    }
+
+    /// Goes over space and comments.
+    fn skip_space(&mut self) {
+        loop {
+            self.take_while(char::is_whitespace);
+            if !self.skip("#") {
+                return;
+            }
+            if self.bracket().is_none() {
+                self.take_while(|c| c != '\n');
+            }
+        }
+    }
+
+    /// The text of `[[text]]` or `[=[text]=]`; none, and nothing is read, where there is none.
+    fn bracket(&mut self) -> Option<&'a str> {
+        let inside = self.rest.strip_prefix('[')?;
+        let signs = inside.len() - inside.trim_start_matches('=').len();
+        let inside = inside[signs..].strip_prefix('[')?;
+        let end = format!("]{}]", "=".repeat(signs));
+        let (text, rest) = inside.split_once(end.as_str())?;
+        self.rest = rest;
+        Some(text)
+    }
+
+    /// Up to the parenthesis that closes the command; none where none does. Inner parentheses are arguments.
+    fn arguments(&mut self) -> Option<Vec<String>> {
+        let mut found = Vec::new();
+        let mut depth = 0;
+        loop {
+            self.skip_space();
+            if let Some(text) = self.bracket() {
+                found.push(text.to_owned());
+                continue;
+            }
+            match self.rest.chars().next()? {
+                ')' if depth == 0 => {
+                    self.next();
+                    return Some(found);
+                }
+                parenthesis @ ('(' | ')') => {
+                    self.next();
+                    depth = if parenthesis == '(' {
+                        depth + 1
+                    } else {
+                        depth - 1
+                    };
+                    found.push(parenthesis.to_string());
+                }
+                '"' => {
+                    self.next();
+                    found.push(self.word(|c| c == '"')?);
+                    self.next();
+                }
+                _ => found.push(self.word(|c| c.is_whitespace() || "()\"#".contains(c))?),
+            }
+        }
+    }
+
+    /// Up to one of these that no backslash stands before.
+    fn word(&mut self, is_end: impl Fn(char) -> bool) -> Option<String> {
+        let mut word = String::new();
+        loop {
+            let c = self.rest.chars().next()?;
+            if is_end(c) {
+                return Some(word);
+            }
+            self.next();
+            word.push(if c == '\\' { self.next()? } else { c });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn whatever_is_read_ends(text in "[a(\\[\\]=)\"\\\\#\n ß$]{0,60}") {
+            let read: usize = commands(&text).iter().map(|command| command.name.len()).sum();
+            prop_assert!(read <= text.len());
+        }
+    }
+
+    #[test]
+    fn commands_are_read_as_they_are_written() {
+        let text = r#"
+            # a comment with add_executable(nothing)
+            PROJECT(demo) #[[ a long
+            one ) ]] set(X "a \"b\" (c" d;e ${F})
+            if((A OR B) AND NOT C) # why (
+              add_library(x [=[ raw ] ) ]=] a\ b)
+            endif()
+            torn("never ends
+        "#;
+        let told: Vec<String> = commands(text)
+            .into_iter()
+            .map(|command| format!("{}:{}", command.name, command.arguments.join("|")))
+            .collect();
+        assert_eq!(
+            told,
+            [
+                "project:demo",
+                "set:X|a \"b\" (c|d;e|${F}",
+                "if:(|A|OR|B|)|AND|NOT|C",
+                "add_library:x| raw ] ) |a b",
+                "endif:",
+            ]
+        );
+        for nothing in ["", "(", ")", "x", "x(", "# x(", "\u{fffd}(]", "[[", "a([["] {
+            assert!(commands(nothing).is_empty(), "{nothing}");
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! Programs that build files install in plain words.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use foreign::Tree;
+use ros::bus::RosVersion;
+
+use crate::cmake::{self, Command};
+use crate::read;
+use crate::workspace::Package;
+
+/// The largest build file that is read.
+const MAX_BYTES: u64 = 1 << 20;
+/// How deep `add_subdirectory` is followed, and how many files are read.
+const MAX_DEPTH: usize = 8;
+const MAX_FILES: usize = 200;
+
+/// Words by which a build file decides otherwise where its programs are, or whether they are made.
+const UNCLEAR: [&str; 3] = [
+    "RUNTIME_OUTPUT_DIRECTORY",
+    "OUTPUT_NAME",
+    "EXCLUDE_FROM_ALL",
+];
+
+/// Commands between which and their ends nothing is certain.
+const BLOCKS: [&str; 6] = ["if", "foreach", "while", "function", "macro", "block"];
+
+/// What a package's build files show.
+#[derive(Debug, Default)]
+pub(super) struct Shown {
+    /// Names of programs, with variables that are not known.
+    pub(super) programs: BTreeSet<String>,
+    /// Directories of the package that are installed as a whole.
+    pub(super) launch_directories: Vec<String>,
+    /// A launch file may be made or renamed.
+    pub(super) mentions_launch: bool,
+}
+
+/// Reads the build files of a package.
+pub(super) fn of(root: &Path, package: &Package, version: RosVersion) -> Shown {
+    let mut reading = Reading {
+        root,
+        package: &package.path,
+        name: &package.manifest.name,
+        version,
+        shown: Shown::default(),
+        targets: BTreeSet::new(),
+        has_place: version == RosVersion::Two,
+        is_unclear: package.manifest.build_type == "cmake",
+        files: 0,
+    };
+    if package.manifest.build_type == "ament_python" {
+        reading.python();
+    } else {
+        reading.file(&package.path, MAX_DEPTH);
+    }
+    if reading.is_unclear {
+        reading.shown.programs.clear();
+        reading.shown.launch_directories.clear();
+    }
+    reading.shown
+}
+
+struct Reading<'a> {
+    root: &'a Path,
+    package: &'a Path,
+    name: &'a str,
+    version: RosVersion,
+    shown: Shown,
+    /// Programs that are compiled.
+    targets: BTreeSet<String>,
+    /// Programs that are compiled from here on are where `rosrun` looks: `catkin_package` says so.
+    has_place: bool,
+    is_unclear: bool,
+    files: usize,
+}
+
+impl Reading<'_> {
+    /// Reads the `CMakeLists.txt` of a directory, and those that it adds; gives whether what comes after it is certain.
+    fn file(&mut self, directory: &Path, depth: usize) -> bool {
+        self.files += 1;
+        let path = self.root.join(directory).join("CMakeLists.txt");
+        let text = read::text_inside(self.root, &path, MAX_BYTES);
+        let Ok(text) = text else {
+            return false;
+        };
+        if self.files > MAX_FILES || UNCLEAR.iter().any(|word| text.contains(word)) {
+            self.is_unclear = true;
+        }
+        let launch = match self.version {
+            RosVersion::One => ".launch",
+            RosVersion::Two => "launch",
+        };
+        self.shown.mentions_launch |= text.contains(launch);
+        let mut open = 0_usize;
+        for command in cmake::commands(&text) {
+            if BLOCKS.contains(&command.name.as_str()) {
+                open += 1;
+            } else if let Some(block) = command.name.strip_prefix("end")
+                && BLOCKS.contains(&block)
+            {
+                open = open.saturating_sub(1);
+            } else if command.name == "return" || command.name == "include" && is_own(&command) {
+                // What follows may not be reached, or be in other hands.
+                return false;
+            } else if open == 0 && !self.command(&command, directory, depth) {
+                return false;
+            }
+        }
+        true
+    }
+
+    fn command(&mut self, command: &Command, directory: &Path, depth: usize) -> bool {
+        let arguments = command.arguments.as_slice();
+        match (command.name.as_str(), arguments) {
+            ("catkin_package", _) => self.has_place = true,
+            ("add_executable", [target, ..]) => {
+                let is_made = !arguments
+                    .iter()
+                    .any(|word| word == "IMPORTED" || word == "ALIAS");
+                if is_made && self.has_place {
+                    let target = self.named(target);
+                    if self.version == RosVersion::One {
+                        self.shown.programs.insert(target.clone());
+                    }
+                    self.targets.insert(target);
+                }
+            }
+            ("add_subdirectory", [inner]) if depth > 0 && !inner.contains('$') => {
+                return self.file(&directory.join(inner), depth - 1);
+            }
+            ("install" | "catkin_install_python", [kind, rest @ ..]) => {
+                self.install(kind, rest, directory);
+            }
+            _ => {}
+        }
+        true
+    }
+
+    fn install(&mut self, kind: &str, arguments: &[String], directory: &Path) {
+        let Some(at) = arguments.iter().position(|word| word == "DESTINATION") else {
+            return;
+        };
+        let Some(destination) = arguments.get(at + 1) else {
+            return;
+        };
+        let destination = self.named(destination.trim_end_matches('/'));
+        let of_programs = [
+            "${CATKIN_PACKAGE_BIN_DESTINATION}".to_owned(),
+            format!("lib/{}", self.name),
+        ];
+        let is_plain = |word: &&String| !word.contains('$');
+        let listed = &arguments[..at];
+        match kind {
+            "PROGRAMS" if of_programs.contains(&destination) && arguments.len() == at + 2 => {
+                let files = listed.iter().filter(is_plain);
+                let files = files.filter(|file| !file.ends_with(".cfg"));
+                let there = files.filter(|file| self.has_file(&directory.join(file)));
+                let names = there.filter_map(|file| Some(file.rsplit('/').next()?.to_owned()));
+                let names: Vec<String> = names.collect();
+                self.shown.programs.extend(names);
+            }
+            "TARGETS" if of_programs.contains(&destination) => {
+                let is_for_others = |word: &String| word == "ARCHIVE" || word == "LIBRARY";
+                if !listed.iter().any(is_for_others) {
+                    let names = listed.iter().map(|target| self.named(target));
+                    let names: Vec<String> =
+                        names.filter(|name| self.targets.contains(name)).collect();
+                    self.shown.programs.extend(names);
+                }
+            }
+            "DIRECTORY"
+                if destination == format!("share/{}", self.name)
+                    && arguments.len() == at + 2
+                    && directory == self.package =>
+            {
+                let directories = listed.iter().filter(is_plain);
+                let names = directories.map(|name| name.trim_end_matches('/').to_owned());
+                self.shown.launch_directories.extend(names);
+            }
+            _ => {}
+        }
+    }
+
+    /// With the project's name, by which many targets and places are named.
+    fn named(&self, text: &str) -> String {
+        text.replace("${PROJECT_NAME}", self.name)
+    }
+
+    fn has_file(&self, path: &Path) -> bool {
+        let found = Tree::open(self.root).and_then(|tree| tree.file_following(path, MAX_BYTES));
+        found.is_ok_and(|file| file.is_some())
+    }
+
+    /// Reads the programs that `setup.py` lists, if `setup.cfg` has them installed where `ros2 run` looks.
+    fn python(&mut self) {
+        let text = |name: &str| {
+            let path: PathBuf = self.root.join(self.package).join(name);
+            read::text_inside(self.root, &path, MAX_BYTES).unwrap_or_default()
+        };
+        let (setup, places) = (text("setup.py"), text("setup.cfg"));
+        self.shown.mentions_launch |= setup.contains("launch");
+        if places.contains(&format!("/lib/{}", self.name)) {
+            self.shown.programs.extend(scripts(&setup));
+        }
+    }
+}
+
+/// Whether a file of the package itself is included, and not a module of CMake.
+fn is_own(command: &Command) -> bool {
+    command
+        .arguments
+        .first()
+        .is_some_and(|file| file.contains(['/', '.', '$']))
+}
+
+/// Names before `=` in the list of `console_scripts`, which must be one of texts alone.
+fn scripts(setup: &str) -> Vec<String> {
+    let Some((_, rest)) = setup.split_once("console_scripts") else {
+        return Vec::new();
+    };
+    let list = rest
+        .trim_start_matches(|c: char| c.is_whitespace() || "'\":=".contains(c))
+        .strip_prefix('[')
+        .and_then(|rest| rest.split_once(']'));
+    let Some((list, _)) = list else {
+        return Vec::new();
+    };
+    let entries = list
+        .lines()
+        .map(|line| line.split('#').next().unwrap_or_default());
+    let entries: String = entries.collect();
+    let names = entries
+        .split(',')
+        .map(str::trim)
+        .filter(|entry| !entry.is_empty());
+    let names = names.map(|entry| {
+        let inside = entry.strip_prefix(['\'', '"'])?.strip_suffix(['\'', '"'])?;
+        Some(inside.split_once('=')?.0.trim().to_owned())
+    });
+    names.collect::<Option<_>>().unwrap_or_default()
+}
