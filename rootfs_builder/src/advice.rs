@@ -15,6 +15,10 @@ use crate::keys;
 enum Missed<'a> {
     /// CMake's `find_package(NAME)`.
     Config(&'a str),
+    /// The same, by a module of CMake's own, `FindNAME.cmake`.
+    Found(&'a str),
+    /// CMake's `pkg_check_modules(… NAME)`.
+    PkgConfig(&'a str),
     /// Python's `import NAME`.
     Module(&'a str),
     /// A shared library by its file name.
@@ -44,6 +48,15 @@ impl<'a> Known<'a> {
         }
     }
 
+    /// To an archive for a base of ROS 1.
+    #[cfg(test)]
+    pub(crate) fn of_one(contents: &'a Contents) -> Self {
+        Self {
+            contents,
+            two: None,
+        }
+    }
+
     /// The package to add for a missing configuration of CMake.
     fn config(&self, name: &str) -> Option<String> {
         let mut debs = self.contents.cmake_config(name);
@@ -58,8 +71,15 @@ impl<'a> Known<'a> {
         }
     }
 
+    /// The package to add for a missing module of pkg-config.
+    fn pkg_config(&self, name: &str) -> Option<String> {
+        let mut debs = self.contents.pkg_config(name);
+        debs.retain(|deb| self.two.is_none_or(|two| two.fits(deb)));
+        nearest(&debs, name).map(str::to_owned)
+    }
+
     /// The package to add for a missing module of Python.
-    fn module(&self, name: &str) -> Option<String> {
+    pub(crate) fn module(&self, name: &str) -> Option<String> {
         let mut debs = self.contents.python_module(name);
         match self.two {
             None => nearest(&debs, name).map(str::to_owned),
@@ -107,11 +127,25 @@ impl Two<'_> {
 
 /// One line of advice for each missing thing that `words` names; empty if it names none.
 pub(crate) fn for_words(words: &str, known: Known<'_>) -> Vec<String> {
-    let missed: BTreeSet<Missed<'_>> = words.lines().filter_map(missed).collect();
+    // What CMake looks for and does not find need not be required: what is, is named again (`inside/second_look.py`).
+    let lines = words.lines().filter(|line| !line.starts_with("-- "));
+    let missed: BTreeSet<Missed<'_>> = lines.filter_map(missed).collect();
     missed
         .into_iter()
         .map(|missed| match missed {
             Missed::Config(name) => told(&format!("the CMake package {name}"), known.config(name)),
+            Missed::Found(name) => match known.config(name) {
+                // Whether the archive has it nobody knows: such modules look for files.
+                None => format!(
+                    "{name} is missing, which CMake looks for by Find{name}.cmake: push with `--with PACKAGE`, the Debian \
+                     package that has its files"
+                ),
+                found => told(&format!("the CMake package {name}"), found),
+            },
+            Missed::PkgConfig(name) => told(
+                &format!("the pkg-config module {name}"),
+                known.pkg_config(name),
+            ),
             Missed::Module(name) => told(&format!("the Python module {name}"), known.module(name)),
             Missed::Library(name) => told(&format!("the library {name}"), known.library(&name)),
         })
@@ -168,11 +202,30 @@ pub(crate) fn nearest<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a st
         .copied()
 }
 
+/// Whether a line of output names something missing.
+pub(crate) fn names_missing(line: &str) -> bool {
+    missed(line).is_some()
+}
+
 fn missed(line: &str) -> Option<Missed<'_>> {
     let after = |words: &str| line.split_once(words).map(|(_, rest)| rest);
     let until = |rest: &'_ str, ends: &[char]| rest.find(ends).unwrap_or(rest.len());
     if let Some(rest) = after("Could not find a package configuration file provided by \"") {
         return Some(Missed::Config(&rest[..until(rest, &['"'])]));
+    }
+    if let Some(rest) = after("Could NOT find ")
+        && let Some((name, _)) = rest.split_once(" (missing:")
+        && !line.starts_with("-- ")
+    {
+        return Some(Missed::Found(name));
+    }
+    if let Some((name, _)) = after("No package '").and_then(|rest| rest.split_once("' found")) {
+        return Some(Missed::PkgConfig(name));
+    }
+    if let Some((name, rest)) = after("Package '").and_then(|rest| rest.split_once("', "))
+        && rest.ends_with("not found")
+    {
+        return Some(Missed::PkgConfig(name));
     }
     if let Some(rest) = after("No module named ") {
         let rest = rest.trim_start_matches(['\'', '"']);
@@ -210,18 +263,14 @@ mod tests {
              usr/lib/{triplet}/libgsl.so libdevel/libgsl-dev\n\
              usr/share/topic_tools/package.xml devel/libtopic-tools-dev\n\
              usr/lib/topic_tools/relay utils/topic-tools\n\
-             usr/lib/gcc/relay devel/gcc\n"
+             usr/lib/gcc/relay devel/gcc\n\
+             usr/lib/{triplet}/pkgconfig/gsl.pc libdevel/libgsl-dev\n\
+             usr/share/pkgconfig/eigen3.pc libdevel/libeigen3-dev\n\
+             usr/share/eigen3/cmake/Eigen3Config.cmake libdevel/libeigen3-dev\n"
         );
         let contents = Contents::open(directory.path(), &[list(directory.path(), "c.gz", &text)])
             .expect("read");
         (directory, contents)
-    }
-
-    fn of_one(contents: &Contents) -> Known<'_> {
-        Known {
-            contents,
-            two: None,
-        }
     }
 
     #[test]
@@ -253,14 +302,47 @@ mod tests {
                 "the library libgsl.so.27 is missing: push with `--with libgsl27`",
             ),
             (
+                "No package 'gsl' found, for pkg-config",
+                "the pkg-config module gsl is missing: push with `--with libgsl-dev`",
+            ),
+            (
+                "Package 'eigen3', required by 'virtual:world', not found",
+                "the pkg-config module eigen3 is missing: push with `--with libeigen3-dev`",
+            ),
+            (
+                "  Could NOT find Eigen3 (missing: Eigen3_DIR)",
+                "the CMake package Eigen3 is missing: push with `--with libeigen3-dev`",
+            ),
+            (
+                "  Could NOT find GLUT (missing: GLUT_glut_LIBRARY)",
+                "GLUT is missing, which CMake looks for by FindGLUT.cmake: push with `--with PACKAGE`, the Debian package \
+                 that has its files",
+            ),
+            (
                 "Could not find a package configuration file provided by \"warp\" with",
                 "the CMake package warp is missing, and no package of the archive has it: push a workspace that holds \
                  its source, too",
             ),
         ] {
-            assert_eq!(for_words(words, of_one(&contents)), [advice], "{words}");
+            assert_eq!(
+                for_words(words, Known::of_one(&contents)),
+                [advice],
+                "{words}"
+            );
         }
-        assert!(for_words("main.cpp:3: error: expected ;", of_one(&contents)).is_empty());
+        for words in [
+            "main.cpp:3: error: expected ;",
+            // Nobody said that they are required.
+            "--   No package 'gsl' found",
+            "--   Package 'gsl', required by 'virtual:world', not found\n\
+             CMake Error at /usr/share/cmake-3.25/Modules/FindPkgConfig.cmake:607 (message):",
+            "-- Could NOT find Eigen3 (missing: Eigen3_DIR)",
+        ] {
+            assert!(
+                for_words(words, Known::of_one(&contents)).is_empty(),
+                "{words}"
+            );
+        }
     }
 
     #[test]
@@ -272,7 +354,7 @@ mod tests {
             known: "none".into(),
             elsewhere: String::new(),
         };
-        let text = on(error, of_one(&contents)).to_string();
+        let text = on(error, Known::of_one(&contents)).to_string();
         assert!(
             text.contains("there are: none")
                 && text.contains("`--apt topic_tools`")

@@ -67,11 +67,8 @@ impl Archive {
         if bare.len() < 3 {
             return Vec::new();
         }
-        let mut near: Vec<&str> = self
-            .candidates
-            .names()
-            .filter(|name| name.contains(&bare))
-            .collect();
+        let names = self.candidates.names();
+        let mut near: Vec<&str> = names.filter(|name| has_word(name, &bare)).collect();
         near.sort_by_key(|name| (name.len(), *name));
         near.into_iter().take(3).map(str::to_owned).collect()
     }
@@ -135,6 +132,22 @@ impl Archive {
     }
 }
 
+/// Names shorter than this are in many others by chance.
+const TELLING: usize = 5;
+
+/// Whether a Debian package's name has these words from the beginning of one of its own: `libeigen3-dev` has `eigen`. Behind
+/// a short one, only a number may come.
+fn has_word(name: &str, words: &str) -> bool {
+    name.match_indices(words).any(|(at, _)| {
+        let before = &name[..at];
+        let before = before.strip_suffix("lib").unwrap_or(before);
+        let rest = name[at + words.len()..].split('-').next();
+        let is_number = |c: char| c.is_ascii_digit() || c == '.' || c == '+';
+        (before.is_empty() || before.ends_with('-'))
+            && (words.len() >= TELLING || rest.is_none_or(|rest| rest.chars().all(is_number)))
+    })
+}
+
 /// How far a ROS package is from what was asked for. The further, the more of it is left to the dependencies that
 /// Debian's maintainers wrote down.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -157,4 +170,44 @@ pub(crate) struct Carried {
     pub(crate) install: BTreeSet<String>,
     /// For their files only.
     pub(crate) unpack: BTreeSet<String>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_look_alike_begin_alike() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let names = [
+            "wpg2odg",
+            "libeigen3-dev",
+            "libg2opt-dev",
+            "ros-robot-localization",
+            "libceres-dev",
+            "maceres-tools",
+            "pclock",
+            "libpcl-dev",
+            "libpcl1.13",
+        ];
+        let archive = Archive {
+            apt: Apt::open(directory.path(), "").expect("prepared"),
+            contents: Contents::open(directory.path(), &[]).expect("read").into(),
+            candidates: crate::candidates::tests::named(&names),
+            stamp: String::new(),
+            sources: String::new(),
+        };
+        for (key, expected) in [
+            // Part of another word means nothing.
+            ("libg2o", &[][..]),
+            ("ceres-solver", &[]),
+            ("ceres", &["libceres-dev"]),
+            // Short names have numbers behind them, and no letters.
+            ("pcl", &["libpcl-dev", "libpcl1.13"]),
+            ("eigen", &["libeigen3-dev"]),
+            ("robot_localization", &["ros-robot-localization"]),
+        ] {
+            assert_eq!(archive.similar(key), expected, "{key}");
+        }
+    }
 }

@@ -9,7 +9,7 @@ use image::{Digest, ImageSpec};
 use package::inventory::{Inventory, Published};
 use ros::flavour::Version;
 
-use crate::advice;
+use crate::advice::{self, Known};
 use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
@@ -22,6 +22,7 @@ use crate::keys;
 use crate::launch::{self, Ask, LaunchPlan};
 use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
+use crate::undeclared;
 use crate::workshop::{Layer, Workshop};
 
 /// Where dpkg writes down what is installed.
@@ -218,7 +219,7 @@ impl Build<'_> {
             &ask,
         )
         .await
-        .map_err(|error| advice::on(error, advice::Known::of(&self.archive, &self.base)))?;
+        .map_err(|error| advice::on(error, Known::of(&self.archive, &self.base)))?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }
@@ -232,7 +233,8 @@ impl Build<'_> {
         let package = pushed::subject(&made.packages, &answer.nodes);
         let version = made.versions.get(&package).cloned().unwrap_or_default();
         let of = (package.clone(), environment.clone(), answer.nodes.clone());
-        let inventory = crate::blocking::reading(move || {
+        let known = (self.archive.clone(), self.base.clone());
+        let (inventory, undeclared) = crate::blocking::reading(move || {
             let (package, environment, nodes) = of;
             let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
             let of = Published {
@@ -240,9 +242,19 @@ impl Build<'_> {
                 environment: &environment,
                 commands: &commands,
             };
-            Inventory::take(&trees, of)
+            let inventory = Inventory::take(&trees, of)?;
+            let (archive, base) = known;
+            let undeclared = match base.ros {
+                Version::Ros1 => undeclared::advice(&trees, &inventory, Known::of(&archive, &base)),
+                // Its programs are made by setuptools, and import their packages by name.
+                Version::Ros2 => Vec::new(),
+            };
+            Ok::<_, Error>((inventory, undeclared))
         })
         .await??;
+        for words in undeclared {
+            self.progress.warn(words).await;
+        }
         launch::check_composition(&answer.components, &inventory.definitions)?;
         let layers = self.packed(parts).await?;
         let spec = ImageSpec {

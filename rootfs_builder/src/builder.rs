@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, Store};
-use package::workspace::Pushed;
+use package::foreseen;
+use package::workspace::{Pushed, Workspace};
 use ros::flavour::Version;
 use servant::sandbox::Sandbox;
 use servant::spec::Limits;
@@ -25,9 +26,10 @@ use crate::install::Made;
 use crate::removal::Removals;
 use crate::request::{BuildOutcome, PushRequest, Source};
 use crate::sandbox::{self, Site};
-use crate::workshop::{Turns, Workshop};
+use crate::workshop::{Push, Turns, Workshop};
 use crate::{
-    blocking, choice, keys, packaged, prebuilt, pushed, seal, source, sources, unused, wheels,
+    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources,
+    unused, wheels,
 };
 
 /// The base taken when none is named, for what can be built for ROS 1.
@@ -64,7 +66,13 @@ pub struct Builder {
     layers: Layers,
     turns: Turns,
     removals: Removals,
-    archives: tokio::sync::Mutex<HashMap<String, Arc<Archive>>>,
+    archives: tokio::sync::Mutex<HashMap<String, Opened>>,
+}
+
+/// A base with its archive, as the last push found them.
+struct Opened {
+    base: Base,
+    archive: Arc<Archive>,
 }
 
 /// Where the layers to keep for a base are noted.
@@ -75,6 +83,28 @@ pub(crate) fn kept(base: &str) -> String {
 enum What<'a> {
     Tree(Pushed),
     Packaged(&'a str),
+}
+
+impl What<'_> {
+    /// The package that it is about, as far as that shows.
+    fn name(&self) -> String {
+        match self {
+            Self::Tree(pushed) => {
+                let packages = pushed::by_importance(pushed.packages());
+                packages.into_iter().next().unwrap_or_default()
+            }
+            Self::Packaged(name) => (*name).to_owned(),
+        }
+    }
+}
+
+impl Opened {
+    fn of(base: &Base, archive: &Arc<Archive>) -> Self {
+        Self {
+            base: base.clone(),
+            archive: archive.clone(),
+        }
+    }
 }
 
 impl Builder {
@@ -133,12 +163,12 @@ impl Builder {
             self.config.limits.or(&sandbox::default_limits()),
             self.removals.clone(),
         )?;
-        let shop = Workshop::new(site, self.layers.clone(), self.turns.clone());
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             Source::Tree(path) => {
                 let pushed = privilege::reading(|| pushed::inspect(path, &base))?;
-                if matches!(pushed, Pushed::Source(_)) {
+                if let Pushed::Source(workspace) = &pushed {
+                    ask_what_to_run(request, workspace, &base)?;
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;
                 }
@@ -146,6 +176,17 @@ impl Builder {
             }
             Source::Packaged(name) => What::Packaged(name),
         };
+        let push = Push {
+            id: request.id.clone(),
+            name: request.name.clone().unwrap_or_else(|| what.name()),
+        };
+        let shop = Workshop::new(
+            site,
+            self.layers.clone(),
+            self.turns.clone(),
+            push,
+            progress.clone(),
+        );
         let archive = self.archive(&shop, &base, progress).await?;
         if let What::Tree(pushed) = &what {
             early(&archive, &base, request, pushed)?;
@@ -184,12 +225,13 @@ impl Builder {
     /// Finds in `words`, output of a node of an image on this base, what is missing, and the options of `push` that add it.
     /// Empty if the output names nothing missing.
     pub async fn advice(&self, base: &str, words: &str) -> Vec<String> {
+        // Nothing is read here: whoever asks may have no right to.
         let archives = self.archives.lock().await;
-        match (archives.get(base), base::load(&self.config.bases_dir, base)) {
-            (Some(archive), Ok(base)) => {
-                crate::advice::for_words(words, crate::advice::Known::of(archive, &base))
+        match archives.get(base) {
+            Some(Opened { base, archive }) => {
+                advice::for_words(words, advice::Known::of(archive, base))
             }
-            _ => Vec::new(),
+            None => Vec::new(),
         }
     }
 
@@ -210,16 +252,17 @@ impl Builder {
         progress: &Progress,
     ) -> Result<Arc<Archive>, Error> {
         let mut archives = self.archives.lock().await;
-        if let Some(archive) = archives.get(&base.name)
-            && archive.is_fresh()
+        if let Some(opened) = archives.get_mut(&base.name)
+            && opened.archive.is_fresh()
         {
-            return Ok(archive.clone());
+            opened.base = base.clone();
+            return Ok(opened.archive.clone());
         }
         let scratch = shop.site.directory("sources")?;
         let sources = sources::lines(&self.config.sources, base, &scratch).await?;
         let archive =
             Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
-        archives.insert(base.name.clone(), archive.clone());
+        archives.insert(base.name.clone(), Opened::of(base, &archive));
         Ok(archive)
     }
 
@@ -232,7 +275,7 @@ impl Builder {
     ) -> Result<(Made, Arc<Archive>), Error> {
         let resolved = bootstrap::resolve(shop, &archive, base).await?;
         let key = bootstrap::key(base, &resolved);
-        let _turn = shop.turns.take(&key).await;
+        let _turn = shop.turn(&key).await;
         if let Some(entry) = shop.cached(&key).await? {
             return Ok((made_of(&entry, true), archive));
         }
@@ -260,7 +303,7 @@ impl Builder {
         self.archives
             .lock()
             .await
-            .insert(base.name.clone(), archive.clone());
+            .insert(base.name.clone(), Opened::of(base, &archive));
         let resolved = bootstrap::resolve(shop, &archive, base).await?;
         if let Some(layer) = layer {
             let made_from = resolved.iter().map(Deb::to_string).collect();
@@ -272,6 +315,22 @@ impl Builder {
         }
         Ok((made, archive))
     }
+}
+
+/// Asks what to run before time is spent on compiling, where the sources show that it will have to be asked. Blocking.
+fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
+    if request.launch.is_some() || !request.nodes.is_empty() {
+        return Ok(());
+    }
+    let foreseen = privilege::reading(|| foreseen::foresee(workspace, base.ros.bus()));
+    if !foreseen.must_be_chosen() {
+        return Ok(());
+    }
+    Err(Error::NothingToRun {
+        executables: launch::list(&foreseen.executables),
+        launch_files: launch::list(&foreseen.launch_files),
+        more: "; nothing is compiled yet, so there may be others",
+    })
 }
 
 /// Says what nothing provides now, and not after minutes of preparations. Of ROS 2 much may be in a base that is not made

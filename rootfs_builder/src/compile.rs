@@ -17,8 +17,8 @@ use crate::blocking;
 use crate::bootstrap::{EPOCH, tree_options};
 use crate::error::{Error, IoAt};
 use crate::event::Progress;
+use crate::excerpt::Excerpt;
 use crate::install::{lay_out, set_mode};
-use crate::process::Tail;
 use crate::sandbox::Run;
 use crate::workshop::Workshop;
 
@@ -171,6 +171,10 @@ pub(crate) async fn run(
             script(base.ros).as_bytes().to_vec(),
         ),
         (
+            PathBuf::from("cloudroid/second_look.py"),
+            include_str!("inside/second_look.py").as_bytes().to_vec(),
+        ),
+        (
             PathBuf::from("cloudroid/job.json"),
             serde_json::to_vec(&job).unwrap_or_default(),
         ),
@@ -211,7 +215,8 @@ pub(crate) async fn run(
         .units
         .first()
         .map_or_else(String::new, |(unit, _)| unit.name.clone());
-    let mut tail = Tail::default();
+    let mut excerpt = Excerpt::default();
+    let mut looked_at = 0;
     let (mut lines, mut told) = crate::lines::channel();
     let forward = async {
         while let Some(line) = told.recv().await {
@@ -253,8 +258,12 @@ pub(crate) async fn run(
                         current = name.to_owned();
                     } else if let Some(name) = line.strip_prefix("::failed ") {
                         failed.push(name.to_owned());
-                    } else if worth_showing(line) {
-                        tail.push(line);
+                    } else if line.starts_with("::configured ") {
+                        looked_at += 1;
+                        progress.count("packages", looked_at, Some(order.units.len() as u64));
+                        return;
+                    } else {
+                        excerpt.push(line);
                     }
                     lines.send(line.to_owned());
                 },
@@ -275,7 +284,7 @@ pub(crate) async fn run(
         });
     }
     if !finished.success() {
-        let mut last_lines = tail.text();
+        let mut last_lines = excerpt.text();
         if finished.exit.code != Some(1) {
             last_lines = format!("{last_lines}\n{}", finished.last_words());
         }
@@ -334,38 +343,6 @@ fn title(line: &str, units: &[Unit]) -> Option<String> {
     Some(format!("compiling {name} ({at} of {})", units.len()))
 }
 
-/// make's, Ninja's, CMake's and setuptools' own chatter pushes what the compiler said out of the last lines.
-fn worth_showing(line: &str) -> bool {
-    const CHATTER: [&str; 9] = [
-        "make[",
-        "gmake[",
-        "-- ",
-        "copying ",
-        "creating ",
-        "running ",
-        "writing ",
-        "reading ",
-        "byte-compiling ",
-    ];
-    let chatter = CHATTER.iter().any(|start| line.starts_with(start));
-    let progress = is_progress(line) && !line.contains("Error");
-    !chatter && !progress && !line.trim().is_empty()
-}
-
-/// `[ 50%] …` as make says it, or `[3/12] …` as Ninja does.
-fn is_progress(line: &str) -> bool {
-    let Some((inside, _)) = line.strip_prefix('[').and_then(|rest| rest.split_once(']')) else {
-        return false;
-    };
-    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-    match inside.split_once('/') {
-        Some((done, all)) => is_number(done) && is_number(all),
-        None => inside
-            .strip_suffix('%')
-            .is_some_and(|part| is_number(part.trim())),
-    }
-}
-
 /// What was pushed may be readable by its owner alone; the compiling user is another.
 pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
     foreign::walk(source, |entry| {
@@ -422,33 +399,12 @@ pub(crate) fn package_options(base: &Base, owner: u32) -> TreeOptions {
 }
 
 #[cfg(test)]
+mod scripts;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
-
-    #[test]
-    fn the_compilers_words_are_shown_and_makes_are_not() {
-        for line in [
-            "x.cpp:3:5: error: 'y' was not declared",
-            "CMake Error at CMakeLists.txt:3",
-            "  3 | y();",
-            "[rosidl] cannot read Foo.msg",
-            "FAILED: x.o",
-        ] {
-            assert!(worth_showing(line), "{line}");
-        }
-        for line in [
-            "make[2]: *** [x.o] Error 1",
-            "[ 50%] Building CXX object x.o",
-            "-- Found x",
-            "",
-            "[100%] Built",
-            "[3/12] Building C object x.o",
-            "copying node.py -> build/lib/p",
-        ] {
-            assert!(!worth_showing(line), "{line}");
-        }
-    }
 
     #[test]
     fn private_files_become_readable_and_programs_stay_programs() {

@@ -17,8 +17,8 @@ use crate::error::{Error, IoAt};
 #[derive(Debug)]
 pub struct Contents {
     /// Sorted lines: `lNAME\tDEB` for libraries, `rNAME\tDEB\tKINDS` for ROS packages, `cNAME\tDEB` for configuration
-    /// files of CMake (NAME in lower case), `mNAME\tDEB` for Python modules, `pNAME\tDEB\tROSPACKAGE` for programs of
-    /// ROS packages.
+    /// files of CMake (NAME in lower case), `gNAME\tDEB` for modules of pkg-config, `mNAME\tDEB` for Python modules,
+    /// `pNAME\tDEB\tROSPACKAGE` for programs of ROS packages.
     lines: Vec<String>,
 }
 
@@ -61,7 +61,7 @@ impl Part {
 pub type Carriers = BTreeMap<String, BTreeSet<Part>>;
 
 /// Raise it when the file's format or what is kept changes.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 impl Contents {
     /// Opens the boiled-down file of these lists, made now below `cache` if it is not there. Blocking: a few
@@ -141,6 +141,11 @@ impl Contents {
     /// Debian packages by which CMake's `find_package(NAME)` is satisfied.
     pub fn cmake_config(&self, name: &str) -> BTreeSet<&str> {
         self.debs('c', &name.to_lowercase())
+    }
+
+    /// Debian packages with this module of pkg-config.
+    pub fn pkg_config(&self, name: &str) -> BTreeSet<&str> {
+        self.debs('g', name)
     }
 
     /// Debian packages with this Python module (its first name: `numpy` of `numpy.linalg`).
@@ -227,6 +232,7 @@ enum What<'a> {
     /// If there is a ROS package of this name, it is one of its parts.
     Ros(&'a [u8], Part),
     Config(&'a [u8]),
+    PkgConfig(&'a [u8]),
     Module(&'a [u8]),
     /// Its name, and a directory: a program if that is a ROS package.
     Program(&'a [u8], &'a [u8]),
@@ -238,6 +244,7 @@ enum Kept {
     Library(Vec<u8>),
     Ros(Vec<u8>, Part),
     Config(Vec<u8>),
+    PkgConfig(Vec<u8>),
     Module(Vec<u8>),
     Program(Vec<u8>, Vec<u8>),
 }
@@ -248,6 +255,7 @@ impl Kept {
             What::Library(name) => Self::Library(name.to_owned()),
             What::Ros(name, part) => Self::Ros(name.to_owned(), part),
             What::Config(name) => Self::Config(name.to_ascii_lowercase()),
+            What::PkgConfig(name) => Self::PkgConfig(name.to_owned()),
             What::Module(name) => Self::Module(name.to_owned()),
             What::Program(name, package) => Self::Program(name.to_owned(), package.to_owned()),
         }
@@ -258,7 +266,8 @@ impl Kept {
             (Self::Library(name), What::Library(new)) => name == new,
             (Self::Ros(name, part), What::Ros(new, new_part)) => *part == new_part && name == new,
             (Self::Config(name), What::Config(new)) => name.eq_ignore_ascii_case(new),
-            (Self::Module(name), What::Module(new)) => name == new,
+            (Self::PkgConfig(name), What::PkgConfig(new))
+            | (Self::Module(name), What::Module(new)) => name == new,
             _ => false,
         }
     }
@@ -308,6 +317,9 @@ fn boil_down(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
                 Kept::Ros(..) => {}
                 Kept::Config(name) => {
                     lines.insert(format!("c{}\t{deb}", text(name)));
+                }
+                Kept::PkgConfig(name) => {
+                    lines.insert(format!("g{}\t{deb}", text(name)));
                 }
                 Kept::Module(name) => {
                     lines.insert(format!("m{}\t{deb}", text(name)));
@@ -388,6 +400,15 @@ fn looked_for(line: &[u8]) -> Option<What<'_>> {
             None => return None,
         };
         return Some(What::Module(name));
+    }
+    if let Some(stem) = path.strip_suffix(b".pc") {
+        let (directory, name) = stem.split_at(memchr::memrchr(b'/', stem)? + 1);
+        let shared = [b"lib/pkgconfig/".as_slice(), b"share/pkgconfig/"];
+        let is_own = directory
+            .strip_prefix(b"lib/")
+            .and_then(|rest| rest.strip_prefix(triplet().as_bytes()))
+            .is_some_and(|rest| rest == b"/pkgconfig/");
+        return (is_own || shared.contains(&directory)).then_some(What::PkgConfig(name));
     }
     let (package, program) = cut(path.strip_prefix(b"lib/")?)?;
     let plain = !program.contains(&b'/') && package != triplet().as_bytes();

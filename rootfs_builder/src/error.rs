@@ -171,13 +171,15 @@ pub enum Error {
     },
     /// Nothing says what to run.
     #[error(
-        "say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}"
+        "say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}{more}"
     )]
     NothingToRun {
         /// Executables of the package.
         executables: String,
         /// Launch files of the package.
         launch_files: String,
+        /// What is to be said of these lists.
+        more: &'static str,
     },
     /// A package of the other ROS than the base's.
     #[error(

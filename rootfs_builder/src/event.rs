@@ -26,6 +26,11 @@ pub enum BuildEvent {
         /// Number of all, where it is known.
         total: Option<u64>,
     },
+    /// It waits until another push has made a layer that both need.
+    Waits {
+        /// The service of that push, or the package that becomes one.
+        push: String,
+    },
     /// Something to know that is no failure.
     Warning {
         /// The text, for people.
@@ -59,6 +64,10 @@ impl Progress {
                 line: line.to_owned(),
             })
             .await;
+    }
+
+    pub(crate) async fn waits(&self, push: String) {
+        let _ = self.0.send(BuildEvent::Waits { push }).await;
     }
 
     pub(crate) async fn warn(&self, message: impl Into<String>) {

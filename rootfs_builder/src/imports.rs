@@ -71,8 +71,7 @@ pub(crate) fn of_package(deb: &Path, cache: &Path) -> Result<Imports, Error> {
             found
                 .modules
                 .extend(of_text(&String::from_utf8_lossy(bytes)));
-        } else if is_python_program(bytes) {
-            let modules = of_text(&String::from_utf8_lossy(bytes));
+        } else if let Some(modules) = of_program(bytes) {
             let name = name.to_string_lossy().into_owned();
             found.programs.insert(name, modules);
         }
@@ -98,6 +97,11 @@ fn wanted(path: &Path) -> bool {
     }
     let parts: Vec<&str> = path.iter().filter_map(|part| part.to_str()).collect();
     matches!(parts.as_slice(), ["usr", "lib", _, program] if !program.contains(".so"))
+}
+
+/// What a program imports; none where it is not one of Python.
+pub(crate) fn of_program(bytes: &[u8]) -> Option<BTreeSet<String>> {
+    is_python_program(bytes).then(|| of_text(&String::from_utf8_lossy(bytes)))
 }
 
 fn is_python_program(bytes: &[u8]) -> bool {

@@ -108,7 +108,7 @@ pub(crate) async fn layers(
         addition.below,
     ));
     let memo = chains.memo(&items);
-    let _turn = shop.turns.take(&memo).await;
+    let _turn = shop.turn(&memo).await;
     // What was put together before is the same again, whatever has been cached since.
     if let Some(keys) = shop.layers.note::<Vec<String>>(&memo)
         && let Some(layers) = at_hand(shop, &keys).await?
@@ -140,7 +140,7 @@ pub(crate) async fn layers(
             bytes: 0,
         };
         let key = chains.key(link.parent.as_deref(), &link.items);
-        let turn = shop.turns.take(&key).await;
+        let turn = shop.turn(&key).await;
         let layer = match at_hand(shop, std::slice::from_ref(&key)).await? {
             Some(mut layers) => layers.remove(0),
             None => {

@@ -269,14 +269,16 @@ pub(crate) fn check_composition(
     }
 }
 
+/// Names for people.
+pub(crate) fn list(names: &[String]) -> String {
+    if names.is_empty() {
+        "none".to_owned()
+    } else {
+        names.join(", ")
+    }
+}
+
 fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
-    let list = |names: &[String]| {
-        if names.is_empty() {
-            "none".to_owned()
-        } else {
-            names.join(", ")
-        }
-    };
     match serde_json::from_slice::<Reply>(text) {
         Ok(Reply::Planned(answer)) => Ok(answer),
         Ok(Reply::Refused { error }) => Err(match error {
@@ -305,6 +307,7 @@ fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
             } => Error::NothingToRun {
                 executables: list(&executables),
                 launch_files: list(&launch_files),
+                more: "",
             },
             Refusal::Setup { file, status } => Error::Inside {
                 what: "sourcing the install space's setup script",
@@ -320,6 +323,8 @@ fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
 
 #[cfg(test)]
 mod composed;
+#[cfg(test)]
+mod of_one;
 #[cfg(test)]
 mod of_two;
 

@@ -88,7 +88,7 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         .with("prefix", prefix.as_os_str().as_encoded_bytes())
         .finish();
     let shop = &build.shop;
-    let turn = shop.turns.take(&key).await;
+    let turn = shop.turn(&key).await;
     if let Some(entry) = shop.cached(&key).await?
         && let Some(layer) = entry.layer
     {

@@ -20,12 +20,11 @@ pub(crate) const LAST_LINES: usize = 25;
 pub(crate) struct Tail(VecDeque<String>);
 
 impl Tail {
-    /// One more line.
-    pub(crate) fn push(&mut self, line: &str) {
-        if self.0.len() == LAST_LINES {
-            self.0.pop_front();
-        }
+    /// Takes one more line; gives the one that is not among the last ones any more.
+    pub(crate) fn push(&mut self, line: &str) -> Option<String> {
+        let is_full = self.0.len() == LAST_LINES;
         self.0.push_back(line.to_owned());
+        if is_full { self.0.pop_front() } else { None }
     }
 
     /// All of them, one per line.

@@ -14,6 +14,8 @@ use crate::launch::LaunchPlan;
 pub struct PushRequest {
     /// Names the build's directory and its containers: `[a-z0-9-]`, at most 24 characters, unique on this host.
     pub id: String,
+    /// The service that it becomes, where that is known.
+    pub name: Option<String>,
     /// What is pushed.
     pub source: Source,
     /// Name of the base definition; [`crate::DEFAULT_BASE`] if none.

@@ -371,7 +371,7 @@ impl Making<'_> {
     async fn unit(&mut self, index: usize, log: &mut Log) -> Result<(), Error> {
         let build = self.build;
         let named = self.units.key(index, Sight::Named, &self.keys);
-        let turn = build.shop.turns.take(&named).await;
+        let turn = build.shop.turn(&named).await;
         let (key, found) = self.look(index).await?;
         if found && let Some(diff_id) = fetched(build, &key).await? {
             (self.keys[index], self.diff_ids[index]) = (key, Some(diff_id));
@@ -388,7 +388,7 @@ impl Making<'_> {
             {
                 drop(turn);
                 let key = self.units.key(index, Sight::All, &self.keys);
-                let turn = build.shop.turns.take(&key).await;
+                let turn = build.shop.turn(&key).await;
                 let earlier: Vec<usize> = (0..index).collect();
                 let root = self.units.root.clone();
                 let made = self.attempt(index, &earlier, &root, log).await?;
@@ -464,7 +464,7 @@ impl Making<'_> {
     async fn merged(self) -> Result<Made, Error> {
         let shop = &self.build.shop;
         let key = self.whole_key();
-        let turn = shop.turns.take(&key).await;
+        let turn = shop.turn(&key).await;
         if let Some(diff_id) = fetched(self.build, &key).await? {
             return Ok(Made::one(diff_id, true));
         }

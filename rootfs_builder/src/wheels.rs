@@ -103,7 +103,7 @@ async fn layer(
         .with("requirements", wanted.key())
         .with_all("below", below.iter().map(Digest::to_string))
         .finish();
-    let turn = shop.turns.take(&key).await;
+    let turn = shop.turn(&key).await;
     if let Some(layer) = shop.cached(&key).await?.and_then(|entry| entry.layer) {
         return Ok(Made::one(layer.diff_id, true));
     }

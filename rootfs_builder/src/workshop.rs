@@ -12,13 +12,16 @@ use tokio::task::JoinHandle;
 
 use crate::cache::{Entry, Layers};
 use crate::error::Error;
+use crate::event::Progress;
 use crate::sandbox::Site;
 
 /// Lives as long as one build.
 pub(crate) struct Workshop {
     pub(crate) site: Site,
     pub(crate) layers: Layers,
-    pub(crate) turns: Turns,
+    turns: Turns,
+    push: Push,
+    progress: Progress,
     /// Archives that are being made.
     packing: Mutex<Vec<JoinHandle<Result<(), Error>>>>,
 }
@@ -46,13 +49,26 @@ pub(crate) struct Packing {
 }
 
 impl Workshop {
-    pub(crate) fn new(site: Site, layers: Layers, turns: Turns) -> Self {
+    pub(crate) fn new(
+        site: Site,
+        layers: Layers,
+        turns: Turns,
+        push: Push,
+        progress: Progress,
+    ) -> Self {
         Self {
             site,
             layers,
             turns,
+            push,
+            progress,
             packing: Mutex::default(),
         }
+    }
+
+    /// Waits for the turn at a key, of a layer or of what is remembered; while another push has it, that is told.
+    pub(crate) async fn turn(&self, key: &str) -> tokio::sync::OwnedMutexGuard<()> {
+        self.turns.take(key, &self.push, &self.progress).await
     }
 
     /// Makes a layer's tree; the archive follows (see [`Workshop::settled`]). `record` is called with the bytes of
@@ -140,36 +156,104 @@ impl Workshop {
     }
 }
 
+/// A push, as others are told of it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Push {
+    /// Of the push: see [`crate::PushRequest::id`].
+    pub(crate) id: String,
+    /// Of the service, or of the package that becomes one.
+    pub(crate) name: String,
+}
+
 /// One at a time per key: two pushes that need the same layer make it once.
 #[derive(Clone, Default)]
-pub(crate) struct Turns(Arc<std::sync::Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>>);
+pub(crate) struct Turns(Arc<Mutex<HashMap<String, Arc<Turn>>>>);
+
+#[derive(Default)]
+struct Turn {
+    taken: Arc<tokio::sync::Mutex<()>>,
+    /// Who had it last.
+    by: Mutex<Push>,
+}
 
 impl Turns {
-    /// Waits for the turn; it ends when the guard is dropped.
-    pub(crate) async fn take(&self, key: &str) -> tokio::sync::OwnedMutexGuard<()> {
-        let mutex = {
-            let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            all.retain(|_, mutex| Arc::strong_count(mutex) > 1);
-            all.entry(key.to_owned()).or_default().clone()
+    /// Waits for the turn; it ends when the guard is dropped. `progress` is told whom it waits for.
+    async fn take(
+        &self,
+        key: &str,
+        push: &Push,
+        progress: &Progress,
+    ) -> tokio::sync::OwnedMutexGuard<()> {
+        let turn = {
+            let mut all = locked(&self.0);
+            // The guard of a turn holds the lock alone.
+            all.retain(|_, turn| Arc::strong_count(turn) > 1 || Arc::strong_count(&turn.taken) > 1);
+            Arc::clone(all.entry(key.to_owned()).or_default())
         };
-        mutex.lock_owned().await
+        let guard = match Arc::clone(&turn.taken).try_lock_owned() {
+            Ok(guard) => guard,
+            Err(_) => {
+                let by = locked(&turn.by).clone();
+                // The layers of one push are not told to wait for each other.
+                if by.id != push.id {
+                    progress.waits(by.name).await;
+                }
+                Arc::clone(&turn.taken).lock_owned().await
+            }
+        };
+        locked(&turn.by).clone_from(push);
+        guard
     }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
 mod tests {
+    use crate::event::BuildEvent;
+
     use super::*;
 
+    fn push(name: &str) -> Push {
+        Push {
+            id: format!("push-{name}"),
+            name: name.to_owned(),
+        }
+    }
+
     #[tokio::test]
-    async fn turns_are_per_key() {
+    async fn turns_are_per_key_and_who_waits_is_told_for_whom() {
         let turns = Turns::default();
-        let first = turns.take("a").await;
-        let _other = turns.take("b").await;
-        let again = turns.clone();
-        let waiting = tokio::spawn(async move { again.take("a").await });
-        tokio::task::yield_now().await;
+        let (sender, mut told) = tokio::sync::mpsc::channel(8);
+        let progress = Progress::new(sender);
+        let (lab, field) = (push("lab"), push("field"));
+        let first = turns.take("a", &lab, &progress).await;
+        let _other = turns.take("b", &field, &progress).await;
+        let (again, by, telling) = (turns.clone(), field.clone(), progress.clone());
+        let waiting = tokio::spawn(async move { again.take("a", &by, &telling).await });
+        let waits = BuildEvent::Waits {
+            push: "lab".to_owned(),
+        };
+        assert_eq!(told.recv().await, Some(waits));
         assert!(!waiting.is_finished());
         drop(first);
-        waiting.await.expect("it comes");
+        let second = waiting.await.expect("it comes");
+        // Its own layers wait in silence.
+        let (again, by, telling) = (turns.clone(), field, progress.clone());
+        let own = tokio::spawn(async move { again.take("a", &by, &telling).await });
+        tokio::task::yield_now().await;
+        drop(second);
+        own.await.expect("it comes");
+        assert!(told.try_recv().is_err());
+        // Turns that nobody has are forgotten; that of `b` is kept.
+        drop(turns.take("c", &lab, &progress).await);
+        drop(turns.take("d", &lab, &progress).await);
+        let kept: Vec<String> = locked(&turns.0).keys().cloned().collect();
+        assert!(
+            kept.contains(&"b".to_owned()) && !kept.contains(&"c".to_owned()),
+            "{kept:?}"
+        );
     }
 }

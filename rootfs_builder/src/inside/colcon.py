@@ -14,6 +14,8 @@ import stat
 import subprocess
 import sys
 
+import second_look
+
 # What colcon's own Python makes of package.xml files: where one is not valid, colcon would build the package by whatever
 # else it finds there, and not install it as a package of ROS.
 READ_MANIFESTS = """
@@ -108,7 +110,15 @@ def build(package, job, given):
     argv += ["--event-handlers", "console_direct+", "console_start_end-", "console_stderr-", "summary-"]
     # Tests need linters and more, and are not run here.
     argv += ["--cmake-args", "-DBUILD_TESTING=OFF"] + job["cmake"]
-    run(argv, "/build", environment)
+    print("+ " + " ".join(argv), flush=True)
+    status, said = second_look.heard(argv, "/build", environment, aloud=True)
+    if status != 0:
+        if package["build_type"] != "ament_python":
+            cmake = ["cmake", source_of(package), "-DBUILD_TESTING=OFF"] + job["cmake"]
+            for line in second_look.lines(*second_look.missing(cmake, "/build/again", environment, said)):
+                print(line, flush=True)
+        print("%s ended with status %d" % (argv[0], status), flush=True)
+        sys.exit(1)
 
 
 def main():

@@ -3,10 +3,12 @@ them.
 
 Runs as an unprivileged user in a container without network. In: /cloudroid/job.json, sources below
 /cloudroid/source (not written). Out: the prefix; progress and the compilers' output on standard output. A line
-`::package NAME` says which package is next, and `::failed NAME` which failed the check.
+`::package NAME` says which package is next, `::configured NAME` which the check has looked at, and `::failed NAME` which
+failed it.
 """
 
 import concurrent.futures
+import glob
 import json
 import os
 import re
@@ -15,9 +17,19 @@ import stat
 import subprocess
 import sys
 
+import second_look
+
 SOURCES = (".c", ".cc", ".cpp", ".cxx", ".h", ".hh", ".hpp", ".hxx", ".in", ".o", ".a")
 # Neither of use to a running node nor small.
 LEFT_OUT = {".git", ".svn", ".hg", "build", "devel", "install", "test", "tests", "doc", "docs", "include", "__pycache__"}
+# Where an install space has what others look for, by the variable that names such places.
+PLACES = (
+    ("CMAKE_PREFIX_PATH", ("",)),
+    ("LD_LIBRARY_PATH", ("lib",)),
+    ("PATH", ("bin",)),
+    ("PKG_CONFIG_PATH", ("lib/pkgconfig", "lib/*/pkgconfig", "share/pkgconfig")),
+    ("PYTHONPATH", ("lib/python3/dist-packages",)),
+)
 
 
 def run(argv, cwd, environment):
@@ -29,14 +41,22 @@ def run(argv, cwd, environment):
 
 
 def environment_of(prefix, given):
-    """What setup.sh of the packages installed so far makes of the environment."""
+    """The environment in which the packages installed so far are found: what their setup.sh makes of it, which catkin
+    installs, and places that it does not name. Without any package of catkin there is none."""
+    environment = dict(given)
     setup = os.path.join(prefix, "setup.sh")
-    if not os.path.exists(setup):
-        return dict(given)
-    script = '. "$0" >&2 && exec env -0'
-    output = subprocess.run(["/bin/sh", "-c", script, setup], env=given, stdout=subprocess.PIPE, check=True).stdout
-    items = (item.partition("=") for item in output.decode("utf-8", "replace").split("\0") if "=" in item)
-    return {name: value for name, _, value in items if name != "_"}
+    if os.path.exists(setup):
+        script = '. "$0" >&2 && exec env -0'
+        output = subprocess.run(["/bin/sh", "-c", script, setup], env=given, stdout=subprocess.PIPE, check=True).stdout
+        items = (item.partition("=") for item in output.decode("utf-8", "replace").split("\0") if "=" in item)
+        environment = {name: value for name, _, value in items if name != "_"}
+    for variable, places in PLACES:
+        found = [path.rstrip("/") for place in places for path in sorted(glob.glob(os.path.join(prefix, place)))]
+        known = [path for path in environment.get(variable, "").split(":") if path]
+        new = [path for path in found if path not in known]
+        if new:
+            environment[variable] = ":".join(new + known)
+    return environment
 
 
 def copy_missing(source, target):
@@ -100,12 +120,30 @@ def configuration(package, job):
     return argv
 
 
+def look_again(package, argv, environment, said):
+    """What is not there of all that a package requires; see second_look.missing."""
+    directory = directory_of(package) + "-again"
+    argv = [word.replace(directory_of(package), directory) for word in argv]
+    return second_look.missing(argv, directory, environment, said)
+
+
+def configure(package, job, environment):
+    argv = configuration(package, job)
+    print("+ " + " ".join(argv), flush=True)
+    status, said = second_look.heard(argv, directory_of(package), environment, aloud=True)
+    if status != 0:
+        for line in second_look.lines(*look_again(package, argv, environment, said)):
+            print(line, flush=True)
+        print("cmake ended with status %d" % status, flush=True)
+        sys.exit(1)
+
+
 def build(package, job, given):
     prefix, source = job["prefix"], source_of(package)
     directory, devel = directory_of(package), devel_of(package)
     os.makedirs(directory)
     environment = environment_of(prefix, given)
-    run(configuration(package, job), directory, environment)
+    configure(package, job, environment)
     run(["cmake", "--build", ".", "--parallel", str(job["jobs"])], directory, environment)
     run(["cmake", "--install", "."], directory, environment)
     add_what_install_forgot(package, source, devel, prefix)
@@ -159,6 +197,17 @@ def may_export(package, name):
     return False
 
 
+def has_modules(package):
+    """Whether a package may install modules of pkg-config."""
+    names = (entry for _, _, files in os.walk(source_of(package)) for entry in files)
+    return any(entry.endswith((".pc", ".pc.in", ".pc.cmake")) for entry in names)
+
+
+def is_nobodys(name, packages, job):
+    """Whether none of the packages that are compiled here can be meant by the name of a CMake configuration."""
+    return name not in job["workspace"] and not any(may_export(other, name) for other in packages)
+
+
 def is_certain(package, output, job):
     """Whether a failed configuration would fail as well once all packages before it are compiled. Wherever that cannot
     be known it is not certain: then it is tried again at its turn."""
@@ -166,8 +215,9 @@ def is_certain(package, output, job):
     text = " ".join(output.split())
     asked = re.findall(r'package configuration file provided by "([^"]+)"', text)
     if asked:
-        known = set(job["workspace"])
-        return any(name not in known and not any(may_export(other, name) for other in others) for name in asked)
+        return any(is_nobodys(name, others, job) for name in asked)
+    if re.search(r"CMake Error at \S+/FindPkgConfig\.cmake", text):
+        return not any(has_modules(other) for other in others)
     if package["needs"]:
         return False
     _, _, complaint = text.partition("CMake Error")
@@ -175,18 +225,20 @@ def is_certain(package, output, job):
 
 
 def configure_only(package, spaces, job, given):
+    """Configures a package; its output where it fails and would fail at its turn as well, else whether it is done."""
     directory = directory_of(package)
     os.makedirs(directory)
-    result = subprocess.run(
-        configuration(package, job),
-        cwd=directory,
-        env=against(spaces, job, given),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        check=False,
-    )
-    return result.returncode, result.stdout.decode("utf-8", "replace")
+    environment = against(spaces, job, given)
+    argv = configuration(package, job)
+    status, said = second_look.heard(argv, directory, environment)
+    if status == 0 or not is_certain(package, said, job):
+        return status == 0, None
+    packages, libraries, modules = look_again(package, argv, environment, said)
+    others = [other for other in job["packages"] if other["name"] != package["name"]]
+    # What another package may bring is not missed yet.
+    packages = [name for name in packages if is_nobodys(name, others, job)]
+    modules = [] if any(has_modules(other) for other in others) else modules
+    return False, "\n".join([said.rstrip("\n")] + second_look.lines(packages, libraries, modules))
 
 
 def check(job, given):
@@ -205,12 +257,13 @@ def check(job, given):
             done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
             for future in done:
                 package = running.pop(future)
-                status, output = future.result()
-                if status == 0:
+                is_done, output = future.result()
+                if is_done:
                     stand_in(package)
                     spaces[package["name"]] = devel_of(package)
-                elif is_certain(package, output, job):
+                elif output is not None:
                     failures[package["name"]] = output
+                print("::configured " + package["name"], flush=True)
     for package in job["packages"]:
         if package["name"] in failures:
             print("::failed " + package["name"], flush=True)

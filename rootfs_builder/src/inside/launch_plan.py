@@ -76,16 +76,26 @@ def below(directory):
             yield os.path.join(parent, name)
 
 
+def is_program(path):
+    """Whether an executable is meant to be run: dynamic_reconfigure's .cfg files are for builds, and of files that are not
+    installed as programs many are executable for no reason."""
+    with open(path, "rb") as file:
+        start = file.read(4)
+    name = os.path.basename(path)
+    return not name.endswith(".cfg") and name != "setup.py" and (start.startswith(b"#!") or start == b"\x7fELF")
+
+
 def executables_of(rospack, package):
-    """Names that rosrun would find, those of lib/PACKAGE first."""
+    """Names of what rosrun would find and is meant to be run, those of lib/PACKAGE first."""
     names = []
     for prefix in prefixes():
         directory = os.path.join(prefix, "lib", package)
         if os.path.isdir(directory):
-            names += [n for n in sorted(os.listdir(directory)) if is_executable(os.path.join(directory, n))]
+            found = [n for n in sorted(os.listdir(directory)) if is_executable(os.path.join(directory, n))]
+            names += [n for n in found if not n.endswith(".cfg")]
     if not names:
         share = package_directory(rospack, package)
-        names = [os.path.basename(p) for p in below(share) if is_executable(p)] if share else []
+        names = [os.path.basename(p) for p in below(share) if is_executable(p) and is_program(p)] if share else []
     return list(dict.fromkeys(names))
 
 
@@ -268,10 +278,17 @@ def make_plan(ask):
     if ask["nodes"]:
         from_executables(ask, rospack, plan, ask["nodes"])
     if not ask["launch"] and not ask["nodes"]:
-        if len(plan["executables"]) == 1:
-            from_executables(ask, rospack, plan, plan["executables"])
-        elif len(plan["launch_files"]) == 1:
-            from_launch_file(dict(ask, launch=plan["launch_files"][0]), rospack, plan)
+        executables, launch_files = plan["executables"], plan["launch_files"]
+        if len(executables) == 1:
+            from_executables(ask, rospack, plan, executables)
+            if launch_files:
+                words = "%s is run by itself, the only executable; for remappings and parameters of a launch file push with --launch: %s"
+                plan["warnings"].append(words % (executables[0], ", ".join(launch_files)))
+        elif len(launch_files) == 1:
+            from_launch_file(dict(ask, launch=launch_files[0]), rospack, plan)
+            if executables:
+                words = "%s is run, the only launch file; for an executable by itself push with --node: %s"
+                plan["warnings"].append(words % (launch_files[0], ", ".join(executables)))
         else:
             raise Refused("nothing", executables=plan["executables"], launch_files=plan["launch_files"])
     for node in plan["nodes"]:

@@ -306,8 +306,14 @@ def make_plan(ask):
     if not launch and not nodes:
         if len(plan["executables"]) == 1:
             nodes = plan["executables"]
+            if plan["launch_files"]:
+                words = "%s is run by itself, the only executable; for remappings and parameters of a launch file push with --launch: %s"
+                plan["warnings"].append(words % (nodes[0], ", ".join(plan["launch_files"])))
         elif len(plan["launch_files"]) == 1 and can_launch():
             launch = plan["launch_files"][0]
+            if plan["executables"]:
+                words = "%s is run, the only launch file; for an executable by itself push with --node: %s"
+                plan["warnings"].append(words % (launch, ", ".join(plan["executables"])))
         elif not plan["executables"] and len(plan["components_known"]) == 1:
             nodes = plan["components_known"]
         else:

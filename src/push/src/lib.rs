@@ -157,7 +157,9 @@ impl Pusher {
         let known = options.name.as_deref().or(options.apt.as_deref());
         let mut admitted = self.places.enter(known, report).await?;
         let mut left = Left::new(&self.options, self.home.join("build").join(id));
-        let made = left.during(self.made(id, options, archive, report)).await?;
+        let made = left
+            .during(self.made(id, options, archive, (by, report)))
+            .await?;
         let (built, imported) = match made {
             Made::Built(built) => (*built, None),
             Made::Imported(imported) => {
@@ -203,7 +205,7 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         archive: Archive,
-        report: &Reporter,
+        (by, report): (&Deployer, &Reporter),
     ) -> Result<Made, Error> {
         let source = match &options.apt {
             Some(package) => {
@@ -235,7 +237,7 @@ impl Pusher {
                 Source::Tree(tree)
             }
         };
-        self.build(id, options, source, report)
+        self.build(id, options, source, (by, report))
             .await
             .map(|built| Made::Built(Box::new(built)))
     }
@@ -330,10 +332,11 @@ impl Pusher {
         id: &str,
         options: &PushOptions,
         source: Source,
-        report: &Reporter,
+        (by, report): (&Deployer, &Reporter),
     ) -> Result<BuildOutcome, Error> {
         let request = PushRequest {
             id: id.to_owned(),
+            name: options.name.clone(),
             source,
             base: options.base.clone(),
             launch: options.launch.clone(),
@@ -347,7 +350,7 @@ impl Pusher {
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {
             while let Some(event) = events.recv().await {
-                report.event(push_event(event)).await;
+                report.event(push_event(event, by)).await;
             }
         };
         let builder = Arc::clone(&self.builder);
@@ -393,8 +396,18 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
     }
 }
 
-fn push_event(event: BuildEvent) -> PushEvent {
+/// What a deployer is told of a build. Of others' services it hears nothing but where it may publish them itself.
+fn push_event(event: BuildEvent, by: &Deployer) -> PushEvent {
     match event {
+        BuildEvent::Waits { push } => {
+            let whose = match by.may(&push) {
+                Ok(()) => format!("the push of {push}"),
+                Err(_) => "another push".to_owned(),
+            };
+            PushEvent::Step {
+                title: format!("waiting: {whose} makes a layer that this one needs, too"),
+            }
+        }
         BuildEvent::Step { title } => PushEvent::Step { title },
         BuildEvent::Log { line } => PushEvent::Log { line },
         BuildEvent::Progress { unit, done, total } => PushEvent::Progress {
@@ -465,6 +478,32 @@ mod tests {
             "there is no package.xml in ."
         );
         assert_eq!(told("nothing to fix", "x"), "nothing to fix");
+    }
+
+    #[test]
+    fn whoever_waits_is_told_for_whom_where_that_may_be_known() {
+        let by = Deployer {
+            owner: None,
+            may: Box::new(|name| {
+                if name.starts_with("lab_") {
+                    Ok(())
+                } else {
+                    Err("not yours".to_owned())
+                }
+            }),
+            over: Box::new(|| Box::pin(std::future::pending())),
+        };
+        for (push, whose) in [
+            ("lab_maps", "the push of lab_maps"),
+            ("field", "another push"),
+        ] {
+            let event = BuildEvent::Waits { push: push.into() };
+            let PushEvent::Step { title } = push_event(event, &by) else {
+                panic!("a step");
+            };
+            let expected = format!("waiting: {whose} makes a layer that this one needs, too");
+            assert_eq!(title, expected);
+        }
     }
 
     #[test]
