@@ -16,6 +16,8 @@ mod acme;
 mod answer;
 #[path = "stories/audit.rs"]
 mod audit;
+#[path = "stories/borrowed.rs"]
+mod borrowed;
 #[path = "stories/bounds.rs"]
 mod bounds;
 #[path = "stories/breakin.rs"]
@@ -201,6 +203,12 @@ fn main() -> ExitCode {
             no_attempt_to_break_out_succeeds,
             nothing_of_the_host_is_reached,
             neighbours_are_not_reached,
+        ],
+        stories![borrowed:
+            services_elsewhere_and_modules_of_plain_packages_are_found,
+            all_that_a_package_forgot_is_named_at_once,
+            a_python_module_that_a_package_forgot_is_named,
+            what_to_run_is_asked_for_before_anything_is_compiled,
         ],
         stories![calibration:
             fewer_cores_take_longer_and_rows_say_how_long,

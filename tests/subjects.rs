@@ -8,6 +8,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("acme", &["cloudroidd", "outbound"]),
     ("answer", &["bridge", "rootfs_builder", "ros"]),
     ("audit", &["portal", "store"]),
+    ("borrowed", &["package", "rootfs_builder"]),
     ("bounds", &["foreign", "push", "rootfs_builder"]),
     ("breakin", &["access"]),
     ("browser", &["portal"]),

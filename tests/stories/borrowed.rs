@@ -1,0 +1,167 @@
+//! What packages that nobody here wrote do differently, each shrunk to what mattered.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use serde_json::{Value, json};
+use support::Verdict;
+use support::deployer::path_str;
+use support::world::world;
+
+/// Writes files below a directory.
+fn write(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
+    for (path, text) in files {
+        let path = directory.join(path);
+        std::fs::create_dir_all(path.parent().context("below")?)?;
+        std::fs::write(path, text)?;
+    }
+    Ok(())
+}
+
+fn manifest(name: &str, needs: &str) -> String {
+    format!(
+        "<package format=\"3\"><name>{name}</name><version>1.0.0</version><description>A part.</description>\
+         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>{needs}</package>\n"
+    )
+}
+
+const OF_CATKIN: &str = "<buildtool_depend>catkin</buildtool_depend><depend>roscpp</depend>";
+
+/// As tf2_web_republisher has its services, and csm its module of pkg-config.
+pub fn services_elsewhere_and_modules_of_plain_packages_are_found() -> Verdict {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let plain = "cmake_minimum_required(VERSION 3.0.2)\nproject(plain_matcher C)\n\
+                 configure_file(matcher.pc.in matcher.pc @ONLY)\n\
+                 install(FILES ${CMAKE_BINARY_DIR}/matcher.pc DESTINATION lib/pkgconfig)\n\
+                 install(FILES matcher.h DESTINATION include)\n";
+    let asker = "cmake_minimum_required(VERSION 3.0.2)\nproject(asker)\n\
+                 find_package(catkin REQUIRED COMPONENTS message_generation roscpp)\n\
+                 find_package(PkgConfig REQUIRED)\npkg_check_modules(MATCHER REQUIRED matcher)\n\
+                 add_service_files(DIRECTORY services FILES Ask.srv)\ngenerate_messages()\n\
+                 catkin_package(CATKIN_DEPENDS message_runtime)\n\
+                 add_executable(asker asker.cpp)\nadd_dependencies(asker ${PROJECT_NAME}_generate_messages_cpp)\n\
+                 target_include_directories(asker PRIVATE ${catkin_INCLUDE_DIRS} ${MATCHER_INCLUDE_DIRS} \
+                 ${CATKIN_DEVEL_PREFIX}/include)\n\
+                 target_link_libraries(asker ${catkin_LIBRARIES})\n";
+    let module = "prefix=@CMAKE_INSTALL_PREFIX@\nName: matcher\nDescription: d\nVersion: 1.0\n\
+                  Cflags: -I${prefix}/include\n";
+    let program = "#include <asker/Ask.h>\n#include <matcher.h>\n#include <ros/ros.h>\n\
+                   bool answer(asker::Ask::Request& request, asker::Ask::Response& response) {\n\
+                   \x20 response.answer = request.question + MATCH;\n  return true;\n}\n\
+                   int main(int argc, char** argv) {\n  ros::init(argc, argv, \"asker\");\n  ros::NodeHandle node;\n\
+                   \x20 auto asked = node.advertiseService(\"ask\", answer);\n  ros::spin();\n}\n";
+    let needs = format!(
+        "{OF_CATKIN}<build_depend>message_generation</build_depend><exec_depend>message_runtime</exec_depend>\
+         <depend>plain_matcher</depend>"
+    );
+    let built = "<export><build_type>cmake</build_type></export>";
+    let files = [
+        ("src/plain/package.xml", manifest("plain_matcher", built)),
+        ("src/plain/CMakeLists.txt", plain.to_owned()),
+        ("src/plain/matcher.pc.in", module.to_owned()),
+        ("src/plain/matcher.h", "#define MATCH 2\n".to_owned()),
+        ("src/asker/package.xml", manifest("asker", &needs)),
+        ("src/asker/CMakeLists.txt", asker.to_owned()),
+        (
+            "src/asker/services/Ask.srv",
+            "int64 question\n---\nint64 answer\n".to_owned(),
+        ),
+        ("src/asker/asker.cpp", program.to_owned()),
+    ];
+    write(place.path(), &files)?;
+    let push = ["push", path_str(place.path()), "--name", "asker"];
+    daemon.deployer().types(&push)?.succeeded()?;
+    let answer = daemon
+        .robot("asker")?
+        .calls("/ask", json!({"question": 40}))?;
+    ensure!(answer["values"]["answer"] == 42, "{answer}");
+    Ok(())
+}
+
+/// As A-LOAM forgot them.
+pub fn all_that_a_package_forgot_is_named_at_once() -> Verdict {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(forgetful)\n\
+                 find_package(catkin REQUIRED COMPONENTS roscpp rosbag_storage tf)\n\
+                 find_package(Eigen3 REQUIRED)\nfind_package(PkgConfig REQUIRED)\n\
+                 pkg_check_modules(FROB frob)\npkg_check_modules(GSL REQUIRED gsl)\n\
+                 find_package(no_such_package REQUIRED)\ncatkin_package()\n";
+    write(
+        place.path(),
+        &[
+            ("package.xml", manifest("forgetful", OF_CATKIN)),
+            ("CMakeLists.txt", build.to_owned()),
+        ],
+    )?;
+    let push = ["push", path_str(place.path()), "--node", "any"];
+    let outcome = daemon.deployer().types(&push)?.failed_saying(&[
+        "--with rosbag_storage",
+        "--with tf",
+        "--with libeigen3-dev",
+        "--with libgsl-dev",
+        "the CMake package no_such_package is missing, and no package of the archive has it",
+    ])?;
+    let frob = "the pkg-config module frob is missing";
+    ensure!(!outcome.said().contains(frob), "{}", outcome.said());
+    Ok(())
+}
+
+/// As twist_mux forgot numpy.
+pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(counts_py)\nfind_package(catkin REQUIRED)\n\
+                 catkin_package()\n\
+                 catkin_install_python(PROGRAMS counts.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
+    let needs = "<buildtool_depend>catkin</buildtool_depend><exec_depend>rospy</exec_depend>";
+    let program = "#!/usr/bin/env python3\nimport rospy\nimport numpy\nrospy.init_node('counts')\nrospy.spin()\n";
+    write(
+        place.path(),
+        &[
+            ("package.xml", manifest("counts_py", needs)),
+            ("CMakeLists.txt", build.to_owned()),
+            ("counts.py", program.to_owned()),
+        ],
+    )?;
+    let push = ["push", path_str(place.path())];
+    let missing = "the Python module numpy is missing: push with `--with python3-numpy`";
+    daemon
+        .deployer()
+        .types(&push)?
+        .failed_saying(&["exited with status 1", missing])?;
+    Ok(())
+}
+
+/// As robot_pose_ekf was asked about after eleven minutes.
+pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
+    let daemon = world().shared()?;
+    let place = tempfile::tempdir()?;
+    let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(choosy)\n\
+                 find_package(catkin REQUIRED COMPONENTS roscpp)\ncatkin_package()\n\
+                 add_executable(left it.cpp)\nadd_executable(${PROJECT_NAME}_right it.cpp)\n\
+                 target_link_libraries(left ${catkin_LIBRARIES})\n";
+    write(
+        place.path(),
+        &[
+            ("package.xml", manifest("choosy", OF_CATKIN)),
+            ("CMakeLists.txt", build.to_owned()),
+            ("it.cpp", "this is never compiled\n".to_owned()),
+        ],
+    )?;
+    let push = ["--format", "json", "push", path_str(place.path())];
+    let outcome = daemon.deployer().types(&push)?.failed_saying(&[
+        "say what to run, with --node or --launch; executables: choosy_right, left; launch files: none",
+        "nothing is compiled yet",
+    ])?;
+    let events = outcome.stdout.lines();
+    let events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let titles = events.filter_map(|event| Some(event["title"].as_str()?.to_owned()));
+    let titles: Vec<String> = titles.collect();
+    ensure!(
+        titles.iter().all(|title| !title.contains("compil")),
+        "{titles:?}"
+    );
+    Ok(())
+}
