@@ -4,10 +4,19 @@ use std::sync::Arc;
 
 use access::Grants;
 use async_trait::async_trait;
+use budget::Budget;
 use ros::schema::ServiceDef;
 
 use crate::shared::Shared;
 use crate::{rosapi, tf};
+
+/// The client that calls a service of the bridge's own.
+pub(crate) struct Caller<'a> {
+    /// What it is shown.
+    pub grants: &'a Grants,
+    /// Where what its arguments become counts.
+    pub budget: &'a Budget,
+}
 
 /// A service of the bridge's own.
 #[async_trait]
@@ -25,12 +34,12 @@ pub(crate) trait OwnService: Send + Sync {
     /// Its definition, in the servant's ROS.
     fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String>;
 
-    /// The response, as JSON, to a request in JSON: what a client with these grants is shown.
+    /// The response, as JSON, to a request in JSON.
     async fn answer(
         &self,
         shared: &Arc<Shared>,
         args: &[u8],
-        grants: &Grants,
+        caller: &Caller<'_>,
     ) -> Result<Vec<u8>, String>;
 }
 

@@ -10,8 +10,8 @@ mod typedefs;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use access::Grants;
 use async_trait::async_trait;
+use budget::Budget;
 use ros::bus::RosVersion;
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
@@ -19,7 +19,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::clock;
-use crate::own::OwnService;
+use crate::own::{Caller, OwnService};
 use crate::shared::Shared;
 use typedefs::Definitions;
 
@@ -81,9 +81,9 @@ impl Service {
         self,
         shared: &Arc<Shared>,
         args: &Args,
-        grants: &Grants,
+        caller: &Caller<'_>,
     ) -> Result<Value, String> {
-        let version = shared.bus.version();
+        let (version, grants) = (shared.bus.version(), caller.grants);
         let now = graph::with_own_topics(version, &shared.bus.graph().borrow());
         let now = graph::shown(now, grants);
         let definitions = Definitions {
@@ -117,8 +117,8 @@ impl Service {
                 definitions.of_action(&args.type_name, |of| &of.feedback)?
             }
             name if name.contains("param") => match version {
-                RosVersion::One => self.shared_param(shared, args).await?,
-                RosVersion::Two => self.node_param(shared, args).await?,
+                RosVersion::One => self.shared_param(shared, args, caller.budget).await?,
+                RosVersion::Two => self.node_param(shared, args, caller.budget).await?,
             },
             "get_time" => time(version, clock::now(shared).await),
             "get_ros_version" => json!({
@@ -130,10 +130,15 @@ impl Service {
     }
 
     /// About parameters that all nodes share.
-    async fn shared_param(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    async fn shared_param(
+        self,
+        shared: &Arc<Shared>,
+        args: &Args,
+        budget: &Budget,
+    ) -> Result<Value, String> {
         match self.name {
             "get_param" => params::get(shared, args).await,
-            "set_param" => params::set(shared, args).await,
+            "set_param" => params::set(shared, args, budget).await,
             "has_param" => params::has(shared, args).await,
             "search_param" => params::search(shared, args).await,
             "delete_param" => params::delete(shared, args).await,
@@ -142,10 +147,15 @@ impl Service {
     }
 
     /// About parameters that belong to nodes.
-    async fn node_param(self, shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+    async fn node_param(
+        self,
+        shared: &Arc<Shared>,
+        args: &Args,
+        budget: &Budget,
+    ) -> Result<Value, String> {
         match self.name {
             "get_param" => node_params::get(shared, args).await,
-            "set_param" => node_params::set(shared, args).await,
+            "set_param" => node_params::set(shared, args, budget).await,
             "has_param" => node_params::has(shared, args).await,
             // Nodes have nobody above them of whom to inherit one.
             "search_param" => params::search(shared, args).await,
@@ -179,10 +189,10 @@ impl OwnService for Service {
         &self,
         shared: &Arc<Shared>,
         args: &[u8],
-        grants: &Grants,
+        caller: &Caller<'_>,
     ) -> Result<Vec<u8>, String> {
         let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
-        let values = self.values(shared, &args, grants).await?;
+        let values = self.values(shared, &args, caller).await?;
         Ok(values.to_string().into_bytes())
     }
 }

@@ -11,6 +11,7 @@
 
 #![forbid(unsafe_code)]
 
+mod json;
 mod shares;
 
 use std::fmt;
@@ -21,6 +22,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tokio::sync::Notify;
 
+pub use json::JsonWeight;
 pub use shares::Shares;
 
 /// Up to this size a single message, body or queue counts in no budget: the number of connections limits their sum.

@@ -7,6 +7,7 @@ use std::task::{Context, Waker};
 use std::time::{Duration, Instant};
 
 use access::Operation;
+use budget::JsonWeight;
 use bytes::Bytes;
 use ros::bus::{BusError, CallFate, Digest, ServiceType};
 use ros::codec::{self, CborOptions, JsonOptions};
@@ -19,6 +20,10 @@ use crate::lacking::explain;
 use crate::names::{digest_word, is_same_type, other_type, spelled};
 use crate::own::{self, OwnService};
 use crate::sample::Frame;
+
+/// A service of the bridge's own has what its arguments hold so often, at most, beside what is read of them: in its answer, and on the
+/// way of that.
+const COPIES: usize = 3;
 
 /// A call, free of the frame it came in.
 struct Call {
@@ -253,23 +258,28 @@ impl Client {
         }
         let def = own.definition(&self.shared)?;
         let args = self.own_args(call, &def)?;
+        let mut held = self.budget.permit();
+        let counted = held.count(JsonWeight::of(&args).bytes + COPIES * args.len());
+        counted.map_err(|full| format!("field \"args\": {full}"))?;
         let grants = self.granted().grants();
-        let values = own.answer(&self.shared, &args, &grants).await?;
+        let caller = own::Caller {
+            grants: &grants,
+            budget: &self.budget,
+        };
+        let values = own.answer(&self.shared, &args, &caller).await?;
         self.own_frame(call, &def, &values)
     }
 
     /// The arguments of a call that the bridge answers, as a JSON object.
     fn own_args(&self, call: &Call, def: &ServiceDef) -> Result<Bytes, String> {
-        match call.args() {
-            None => Ok(Bytes::from_static(b"{}")),
-            Some(args)
-                if args.format == Format::Json
-                    && args.is_object()
-                    && call.compression != Compression::CborRaw =>
+        match (call.args(), &call.args) {
+            (None, _) => Ok(Bytes::from_static(b"{}")),
+            (Some(args), Some((Format::Json, bytes)))
+                if args.is_object() && call.compression != Compression::CborRaw =>
             {
-                Ok(Bytes::copy_from_slice(args.bytes))
+                Ok(bytes.clone())
             }
-            args => {
+            (args, _) => {
                 let request = decode_args(&def.request, args, call.compression)?;
                 let mut json = Vec::new();
                 self.print_payload(&def.request, &request, Format::Json, &mut json)?;

@@ -3,13 +3,14 @@
 
 use std::sync::Arc;
 
+use budget::Budget;
 use futures_util::StreamExt;
 use futures_util::stream;
 use ros::bus::{BusError, NodeParameters, ParamValue};
 use serde_json::{Value, json};
 
 use super::Args;
-use super::params::{default, failed, given, written};
+use super::params::{Given, default, failed, written};
 use crate::names::resolve;
 use crate::shared::Shared;
 
@@ -72,7 +73,7 @@ pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, Stri
     let of = named(shared, args)?;
     let value = match value_of(shared, &of).await? {
         Some(value) => Some(written(&value)?),
-        None => default(args),
+        None => default(args)?,
     };
     // Whether it is there is said by later versions of rosapi; clients of earlier ones read a null.
     Ok(match value {
@@ -94,9 +95,14 @@ async fn change(shared: &Shared, of: Named, value: Option<ParamValue>) -> Result
     }
 }
 
-pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
+pub(super) async fn set(
+    shared: &Arc<Shared>,
+    args: &Args,
+    budget: &Budget,
+) -> Result<Value, String> {
     let of = named(shared, args)?;
-    change(shared, of, Some(given(args)?)).await
+    let given = Given::read(args, budget)?;
+    change(shared, of, Some(given.value)).await
 }
 
 pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {

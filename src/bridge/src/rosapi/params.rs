@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
+use budget::{Budget, JsonWeight, Permit};
 use ros::bus::{BusError, ParamValue, RosVersion};
+use serde::de::IgnoredAny;
 use serde_json::{Value, json};
 
 use super::Args;
@@ -21,18 +23,31 @@ pub(super) fn failed(error: BusError) -> String {
     error.to_string()
 }
 
+/// Bytes of a default, at most. A caller that gives a longer one need not have it sent to itself.
+const LONGEST_DEFAULT: usize = 1 << 20;
+
 /// What a caller wants in place of a parameter that is not there, as JSON; none where it does not say.
-pub(super) fn default(args: &Args) -> Option<String> {
-    let default = match args.default.as_str() {
-        "" => args.default_value.as_str(),
-        default => default,
+pub(super) fn default(args: &Args) -> Result<Option<String>, String> {
+    let (field, default) = match args.default.as_str() {
+        "" => ("default_value", args.default_value.as_str()),
+        default => ("default", default),
     };
-    match serde_json::from_str::<Value>(default) {
-        Ok(value) => Some(value.to_string()),
-        Err(_) if default.is_empty() => None,
-        // A default that is no JSON is a text.
-        Err(_) => Some(Value::from(default).to_string()),
+    if default.is_empty() {
+        return Ok(None);
     }
+    if default.len() > LONGEST_DEFAULT {
+        return Err(format!(
+            "field {field:?} has {} bytes, at most {LONGEST_DEFAULT} are taken",
+            default.len()
+        ));
+    }
+    // It is looked at, not read: a tree of it would take many times its bytes.
+    let json = serde_json::from_str::<IgnoredAny>(default);
+    Ok(Some(match json {
+        Ok(_) => default.trim().to_owned(),
+        // A default that is no JSON is a text.
+        Err(_) => Value::from(default).to_string(),
+    }))
 }
 
 /// A value as JSON text.
@@ -43,35 +58,64 @@ pub(super) fn written(value: &ParamValue) -> Result<String, String> {
 pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
     let value = match shared.bus.parameter(&key(args)?).await {
         Ok(value) => written(&value)?,
-        Err(BusError::NoParam(_)) => default(args).unwrap_or_else(|| "null".to_owned()),
+        Err(BusError::NoParam(_)) => default(args)?.unwrap_or_else(|| "null".to_owned()),
         Err(error) => return Err(failed(error)),
     };
     Ok(json!({ "value": value }))
 }
 
-/// The value that a caller gives.
-pub(super) fn given(args: &Args) -> Result<ParamValue, String> {
-    serde_json::from_str(&args.value).map_err(|_| {
-        let shown: String = args.value.chars().take(48).collect();
-        let given = serde_json::from_str::<Value>(&args.value);
-        match given.ok().and_then(|given| null_in(&given, String::new())) {
-            Some(place) if place.is_empty() => {
-                "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one".to_owned()
-            }
-            Some(place) => {
-                format!("field \"value\" holds null at {place}, which no ROS parameter can; leave it out")
-            }
-            None => format!(
-                "field \"value\" is {shown:?}, JSON text (a boolean, number, string, list or object) is expected"
-            ),
-        }
-    })
+/// A value that a caller gives, which counts as the caller's while this exists.
+pub(super) struct Given {
+    pub(super) value: ParamValue,
+    _held: Permit,
 }
 
-pub(super) async fn set(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let value = given(args)?;
+/// The value is read into a tree, and a document is made of that tree for the Master or the node.
+const TREES: usize = 2;
+
+impl Given {
+    /// Reads it.
+    ///
+    /// # Errors
+    /// It is no JSON, holds null, is larger or deeper than a value may be, or has no room in `budget`.
+    pub(super) fn read(args: &Args, budget: &Budget) -> Result<Self, String> {
+        let mut held = budget.permit();
+        let weight = JsonWeight::of(args.value.as_bytes());
+        let counted = held.count(TREES * weight.bytes);
+        counted.map_err(|full| format!("field \"value\": {full}"))?;
+        let value = serde_json::from_str(&args.value);
+        let value = value.map_err(|error| unreadable(&args.value, &error))?;
+        Ok(Self { value, _held: held })
+    }
+}
+
+/// Why a value is none.
+fn unreadable(text: &str, error: &serde_json::Error) -> String {
+    let shown: String = text.chars().take(48).collect();
+    let given = serde_json::from_str::<Value>(text);
+    match given.as_ref().map(|given| null_in(given, String::new())) {
+        Ok(Some(place)) if place.is_empty() => {
+            "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one".to_owned()
+        }
+        Ok(Some(place)) => {
+            format!("field \"value\" holds null at {place}, which no ROS parameter can; leave it out")
+        }
+        Ok(None) => format!("field \"value\" is {shown:?}, which no ROS parameter can be: {error}"),
+        Err(_) => format!(
+            "field \"value\" is {shown:?}, JSON text (a boolean, number, string, list or object) is expected"
+        ),
+    }
+}
+
+pub(super) async fn set(
+    shared: &Arc<Shared>,
+    args: &Args,
+    budget: &Budget,
+) -> Result<Value, String> {
+    let (key, given) = (key(args)?, Given::read(args, budget)?);
     let parameters = shared.bus.parameters().map_err(failed)?;
-    parameters.set(&key(args)?, value).await.map_err(failed)?;
+    let set = parameters.set(&key, given.value);
+    set.await.map_err(failed)?;
     Ok(json!({}))
 }
 
@@ -113,4 +157,66 @@ pub(super) async fn delete(shared: &Arc<Shared>, args: &Args) -> Result<Value, S
 pub(super) async fn names(shared: &Arc<Shared>) -> Result<Value, String> {
     let parameters = shared.bus.parameters().map_err(failed)?;
     Ok(json!({ "names": parameters.names().await.map_err(failed)? }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of(value: &str) -> Args {
+        Args {
+            value: value.to_owned(),
+            ..Args::default()
+        }
+    }
+
+    #[test]
+    fn a_value_that_is_given_counts_while_it_exists() {
+        let budget = Budget::new("client x", 64 << 20);
+        let list = format!("[{}1]", "1,".repeat(10_000));
+        let given = Given::read(&of(&list), &budget).expect("there is room");
+        assert!(budget.used() > 10_000 * size_of::<ParamValue>());
+        drop(given);
+        assert_eq!(budget.used(), 0);
+        // Less than a megabyte.
+        let maps = format!("[{}1]", r#"{"":1},"#.repeat(100_000));
+        let full = Given::read(&of(&maps), &budget).err();
+        let full = full.expect("it has no room");
+        assert!(full.contains("the memory for client x"), "{full}");
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn a_value_that_ros_cannot_have_is_refused_with_its_reason() {
+        let budget = Budget::unlimited();
+        let deep = format!("{}1{}", "[".repeat(101), "]".repeat(101));
+        for (value, words) in [
+            ("null", "call delete_param"),
+            (r#"{"a":[1,null]}"#, "null at /a/1"),
+            ("nonsense", "JSON text (a boolean"),
+            ("", "JSON text (a boolean"),
+            (deep.as_str(), "more than 100 deep"),
+        ] {
+            let refused = Given::read(&of(value), &budget).err();
+            let refused = refused.expect(value);
+            assert!(refused.contains(words), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_default_is_sent_as_it_was_given() {
+        let of = |default: &str| {
+            super::default(&Args {
+                default: default.to_owned(),
+                ..Args::default()
+            })
+        };
+        assert_eq!(of(""), Ok(None));
+        assert_eq!(of(" [1, 2]\n"), Ok(Some("[1, 2]".to_owned())));
+        assert_eq!(of("a \"b"), Ok(Some(r#""a \"b""#.to_owned())));
+        let longest = "1".repeat(LONGEST_DEFAULT);
+        assert!(of(&longest).is_ok());
+        let refused = of(&format!("{longest}1")).expect_err("it is longer");
+        assert!(refused.contains("at most 1048576"), "{refused}");
+    }
 }

@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock, Weak};
 
-use access::Grants;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -17,7 +16,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use super::sending::{Wanted, check, heard_on, send};
 use super::{Buffer, SharedBuffer, array_name, package};
 use crate::fanout::{Listener, Listening};
-use crate::own::OwnService;
+use crate::own::{Caller, OwnService};
 use crate::sample::Sample;
 use crate::shared::Shared;
 
@@ -80,7 +79,7 @@ impl OwnService for RepublishTfs {
         &self,
         shared: &Arc<Shared>,
         args: &[u8],
-        _: &Grants,
+        _: &Caller<'_>,
     ) -> Result<Vec<u8>, String> {
         shared.republisher.call(shared, args)
     }

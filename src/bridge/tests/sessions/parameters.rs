@@ -1,9 +1,11 @@
 //! Parameters that all nodes share, as ROS 1 has them.
 
+use bridge::SessionOptions;
+use budget::Budget;
 use serde_json::{Value, json};
 
 use super::rosapi::{ask, holds};
-use super::support::World;
+use super::support::{Client, World};
 
 #[tokio::test]
 async fn parameters_are_set_found_and_deleted() {
@@ -59,5 +61,41 @@ async fn parameters_are_set_found_and_deleted() {
     assert_eq!(
         ask(&mut client, "get_param", get).await,
         json!({"value": "\"seven\""})
+    );
+}
+
+/// What a client is told that calls a service of rosapi in vain.
+async fn refused(client: &mut Client, service: &str, args: Value) -> String {
+    let service = format!("/rosapi/{service}");
+    let call = json!({"op": "call_service", "service": service, "args": args});
+    client.send(call).await;
+    let answer = client.json().await;
+    assert_eq!(answer["result"], false, "{answer}");
+    answer["values"].as_str().expect("a reason").to_owned()
+}
+
+#[tokio::test]
+async fn what_a_parameter_becomes_counts_in_the_clients_budget() {
+    let world = World::new().await;
+    let budget = Budget::new("client x", 32 << 20);
+    let options = SessionOptions {
+        budget: budget.clone(),
+        ..SessionOptions::default()
+    };
+    let mut client = world.client_with(options).await;
+    // A hundred kilobytes that take megabytes.
+    let maps = |count: usize| format!("[{}1]", r#"{"a":1},"#.repeat(count));
+    let set = json!({"name": "/p", "value": maps(10_000)});
+    assert_eq!(ask(&mut client, "set_param", set).await, json!({}));
+    // A megabyte that would take a hundred of them.
+    let set = json!({"name": "/p", "value": maps(120_000)});
+    let words = refused(&mut client, "set_param", set).await;
+    assert!(words.contains("the memory for client x"), "{words}");
+    let get = json!({"name": "/none", "default": "1".repeat(2 << 20)});
+    let words = refused(&mut client, "get_param", get).await;
+    assert!(words.contains("at most 1048576 are taken"), "{words}");
+    assert_eq!(
+        ask(&mut client, "has_param", json!({"name": "/p"})).await,
+        json!({"exists": true})
     );
 }

@@ -1,6 +1,9 @@
 //! Parameters that all nodes share, where a ROS has them.
 
+mod reading;
+
 use std::collections::BTreeMap;
+use std::hash::{Hash, Hasher};
 
 use async_trait::async_trait;
 use tokio::sync::mpsc;
@@ -34,7 +37,9 @@ pub trait GlobalParameters: Send + Sync {
 }
 
 /// A ROS parameter value. NaN equals NaN: whoever looks for what has changed would never be done otherwise.
-#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+///
+/// What is read of it is bounded: [`MAX_DEPTH`](Self::MAX_DEPTH), [`MAX_VALUES`](Self::MAX_VALUES).
+#[derive(Debug, Clone, serde::Serialize)]
 #[serde(untagged)]
 pub enum ParamValue {
     /// `true` or `false`.
@@ -46,10 +51,9 @@ pub enum ParamValue {
     /// UTF-8 text.
     String(String),
     /// Bytes: XML-RPC's base64. In JSON it is written as base64 text, and read back as text.
-    #[serde(serialize_with = "as_base64", skip_deserializing)]
+    #[serde(serialize_with = "as_base64")]
     Binary(Vec<u8>),
     /// Nothing: a Master may hold it, ROS knows no such value. It is never sent.
-    #[serde(skip_deserializing)]
     Nil,
     /// A list.
     List(Vec<ParamValue>),
@@ -73,6 +77,24 @@ impl PartialEq for ParamValue {
             (Self::List(a), Self::List(b)) => a == b,
             (Self::Map(a), Self::Map(b)) => a == b,
             _ => false,
+        }
+    }
+}
+
+/// Equal values have equal hashes: those of zeros and of NaNs do not depend on their sign and their bits.
+impl Hash for ParamValue {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        std::mem::discriminant(self).hash(state);
+        match self {
+            Self::Bool(truth) => truth.hash(state),
+            Self::Int(number) => number.hash(state),
+            Self::Double(number) if number.is_nan() => f64::NAN.to_bits().hash(state),
+            Self::Double(number) => (number + 0.0).to_bits().hash(state),
+            Self::String(text) => text.hash(state),
+            Self::Binary(bytes) => bytes.hash(state),
+            Self::Nil => {}
+            Self::List(items) => items.hash(state),
+            Self::Map(members) => members.hash(state),
         }
     }
 }

@@ -29,6 +29,7 @@ impl<'a> Value<'a> {
         let mut reader = Reader {
             cursor: Cursor::new(of.version(), bytes)?,
             version: of.version(),
+            left: bytes.len().saturating_add(WITHOUT_BYTES),
         };
         let read = reader.message(of)?;
         // Who writes ROS 2's messages by an estimated size leaves bytes behind them.
@@ -80,9 +81,14 @@ impl<'a> Value<'a> {
     }
 }
 
+/// Values that may take no bytes of a message: fields and items of types without fields.
+const WITHOUT_BYTES: usize = 1000;
+
 struct Reader<'a> {
     cursor: Cursor<'a>,
     version: RosVersion,
+    /// Values that may still come.
+    left: usize,
 }
 
 impl<'a> Reader<'a> {
@@ -111,6 +117,7 @@ impl<'a> Reader<'a> {
     }
 
     fn one(&mut self, base: &'a Base) -> Option<Value<'a>> {
+        self.left = self.left.checked_sub(1)?;
         let primitive = match base {
             Base::Message(message) if message.plan.scalar.is_some() => return self.time(),
             Base::Message(message) => return self.message(message),
@@ -198,5 +205,25 @@ mod tests {
         }
         bytes.push(0);
         assert_eq!(Value::read(&pair, &bytes), None, "more than one message");
+    }
+    #[test]
+    fn values_without_bytes_are_bounded_in_number() {
+        let registry = Registry::new();
+        let fields: String = (0..100).map(|n| format!("Nothing f{n}\n")).collect();
+        for (key, text) in [
+            ("x/msg/Nothing", ""),
+            ("x/msg/Fields", fields.as_str()),
+            ("x/msg/Many", "Fields[] items\nuint8[] rest\n"),
+        ] {
+            registry.insert(key, text).unwrap();
+        }
+        let many = registry.message("x/Many").unwrap();
+        let of = |items: u32, rest: u32| {
+            let lengths = [items.to_le_bytes(), rest.to_le_bytes()].concat();
+            [lengths, vec![0; rest as usize]].concat()
+        };
+        assert!(Value::read(&many, &of(9, 100)).is_some());
+        // A million values, of a message of ten thousand bytes.
+        assert_eq!(Value::read(&many, &of(9_999, 10_000)), None);
     }
 }
