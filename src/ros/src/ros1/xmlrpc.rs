@@ -14,7 +14,7 @@ use std::io;
 use std::time::Duration;
 
 pub use client::Client;
-pub use parse::{Call, MAX_DEPTH, MAX_ELEMENTS, parse_call, parse_response};
+pub use parse::{Call, MAX_DEPTH, MAX_ELEMENTS, parse_call, parse_response, weight};
 pub(crate) use print::fault_value;
 pub use print::{print_call, print_fault, print_response};
 pub use server::{Handler, Limits, MAX_HELD, serve};

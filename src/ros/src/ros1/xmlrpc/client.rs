@@ -5,14 +5,14 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
-use budget::Budget;
+use budget::{Budget, Permit};
 use parking_lot::Mutex;
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::http::{HttpError, Reader};
-use super::{Error, Value, parse_response, print_call};
+use super::http::{HttpError, Reader, SMALL};
+use super::{Error, Value, parse_response, print_call, weight};
 use crate::net::{self, Sockets};
 use crate::ros1::names::PeerUri;
 
@@ -120,6 +120,7 @@ impl Client {
                     });
                 }
             };
+            let (response, _held) = response;
             return parse_response(&response)?.map_err(|fault| Error::Fault {
                 peer: self.peer(),
                 method: method.to_owned(),
@@ -145,8 +146,12 @@ impl Client {
         })
     }
 
-    /// One request and its response; keeps the connection if both sides can.
-    async fn on(&self, connection: Connection, request: &str) -> Result<Vec<u8>, Failure> {
+    /// One request and its response, with the permit for what that becomes; keeps the connection if both sides can.
+    async fn on(
+        &self,
+        connection: Connection,
+        request: &str,
+    ) -> Result<(Vec<u8>, Permit), Failure> {
         let Connection {
             mut stream,
             mut reader,
@@ -175,17 +180,22 @@ impl Client {
             let body = reader
                 .body(&mut stream, &head, MAX_BODY, true, &mut permit)
                 .await?;
+            let weight = weight(&body);
+            if weight > SMALL {
+                let counted = permit.grow_to(weight);
+                counted.map_err(|full| HttpError::Bad(0, full.to_string()))?;
+            }
             let version = head.start.split_whitespace().next().unwrap_or_default();
             let counted = head.field("content-length").is_some();
-            Ok((body, counted && head.keeps_alive(version)))
+            Ok(((body, permit), counted && head.keeps_alive(version)))
         };
         match read.await {
-            Ok((body, keep)) => {
+            Ok((response, keep)) => {
                 let mut idle = self.idle.lock();
                 if keep && idle.len() < MAX_IDLE && reader.is_empty() {
                     idle.push(Connection { stream, reader });
                 }
-                Ok(body)
+                Ok(response)
             }
             Err(HttpError::Io(error)) => Err(Failure::Io(error)),
             Err(HttpError::Bad(_, reason)) => Err(Failure::Http(reason)),

@@ -11,6 +11,24 @@ pub const MAX_DEPTH: usize = 100;
 /// Values in one document, at most.
 pub const MAX_ELEMENTS: usize = 500_000;
 
+/// Bytes that a document takes in memory while it is read and afterwards, at most, itself included. They are known before it is read,
+/// from its tags: a structure of one member is sixty bytes of text, and hundreds of memory.
+pub fn weight(document: &[u8]) -> usize {
+    /// A value in the list that holds it, while that grows.
+    const VALUE: usize = 128;
+    /// The first node of a structure, and a member's name and part of a node.
+    const STRUCT: usize = 640;
+    const MEMBER: usize = 192;
+    let count = |tag: &str| memchr::memmem::find_iter(document, tag).count();
+    // What is no UTF-8 is copied, and grows by that; base64 is gathered and decoded.
+    let is_text = std::str::from_utf8(document).is_ok();
+    let texts = if is_text { 2 } else { 5 } + usize::from(count("<base64") > 0);
+    texts * document.len()
+        + VALUE * count("<value")
+        + STRUCT * count("<struct")
+        + MEMBER * count("<member")
+}
+
 /// A method call.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Call {

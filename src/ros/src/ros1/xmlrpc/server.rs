@@ -15,7 +15,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
 use super::http::{Head, HttpError, Reader, SMALL};
-use super::{Call, Fault, Value, parse_call, print_fault, print_response};
+use super::{Call, Fault, Value, parse_call, print_fault, print_response, weight};
 use crate::net;
 
 /// Answers calls.
@@ -149,8 +149,8 @@ impl Server {
             .await
             .map_err(stalled)??;
         if body.len() > SMALL {
-            // Of a body without a length nobody knew before what it would take.
-            let counted = permit.grow_to(body.len() * FORMS);
+            // Of a body without a length nobody knew before what it would take, nor of many small values.
+            let counted = permit.grow_to(weight(&body).max(body.len() * FORMS));
             counted.map_err(|full| HttpError::Bad(503, full.to_string()))?;
         }
         Ok((body, permit, keep))

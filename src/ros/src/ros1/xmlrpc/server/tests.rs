@@ -231,7 +231,8 @@ async fn the_client_survives_a_connection_closed_between_calls() {
 }
 
 /// A server that sends `answer` to whatever comes, and closes.
-async fn fixed(answer: &'static str) -> SocketAddr {
+async fn fixed(answer: impl Into<String>) -> SocketAddr {
+    let answer = answer.into();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     tokio::spawn(async move {
@@ -274,6 +275,25 @@ async fn the_client_names_what_the_server_does_wrong() {
     .await;
     let answer = client(address).call("echo", &[], LONG).await.unwrap();
     assert_eq!(answer, "x".into());
+}
+
+#[tokio::test]
+async fn an_answer_is_read_if_what_it_becomes_has_room() {
+    let one = "<value><struct><member><name/><value/></member></struct></value>";
+    let answer = |count: usize| {
+        format!(
+            "HTTP/1.0 200 OK\r\n\r\n<methodResponse><params><param><value><array><data>{}</data></array></value></param></params></methodResponse>",
+            one.repeat(count)
+        )
+    };
+    let budget = Budget::new("node x", 4 << 20);
+    let few = client(fixed(answer(2_000)).await).within(&budget);
+    assert!(few.call("echo", &[], LONG).await.is_ok());
+    // 640 KB of text.
+    let many = client(fixed(answer(10_000)).await).within(&budget);
+    let error = many.call("echo", &[], LONG).await.expect_err("no room");
+    assert!(error.to_string().contains("memory for node x"), "{error}");
+    assert_eq!(budget.used(), 0);
 }
 
 #[tokio::test]
