@@ -13,12 +13,15 @@ use ws::WebSocket;
 use crate::address::Address;
 use crate::config::Config;
 use crate::resolver;
+use crate::run;
 use crate::stream::{Stream, refused_certificate};
 
 /// For TCP's own handshake.
 const TCP: Duration = Duration::from_secs(2);
 /// The longest answer to the handshake.
 const MAX_HEAD: usize = 64 * 1024;
+/// For a frame of the server to come as a whole, once it has begun.
+const UNFINISHED: Duration = Duration::from_secs(300);
 const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
 /// Unsent bytes that the kernel may hold: what waits in it cannot be replaced by something newer.
 const UNSENT: u32 = 64 * 1024;
@@ -152,13 +155,14 @@ async fn handshake(
             link::SUBPROTOCOL
         )));
     }
-    Ok(WebSocket::client(
+    let socket = WebSocket::client(
         stream,
         &answer[end..],
         link::MAX_FRAME,
         link::MAX_RECORD,
         rand::random(),
-    ))
+    );
+    Ok(socket.within(&run::FROM_SERVER, UNFINISHED))
 }
 
 /// While a servant is made ready nothing comes, and yet the network may be lost.

@@ -21,7 +21,7 @@ use ws::WebSocket;
 use crate::config::{self, Config};
 use crate::connect;
 use crate::mirror::Mirror;
-use crate::run::session_options;
+use crate::run;
 use crate::stream::Stream;
 use crate::terms;
 
@@ -178,9 +178,10 @@ impl Link<'_> {
             Some(_) => self.welcome,
             None => SERVANT,
         };
+        let mut held = run::FROM_SERVER.permit();
         let opening = async {
             send_open(socket, hello).await?;
-            receive_open(socket, "welcome").await
+            receive_open(socket, "welcome", &mut held).await
         };
         let welcome: Welcome = match timeout(patience, opening).await {
             Ok(Ok(welcome)) => welcome,
@@ -208,9 +209,9 @@ impl Link<'_> {
                 servant,
             } => {
                 if !resumed && self.session.is_some() {
-                    let fresh = RobotSession::new(session_options(self.config));
+                    let fresh = run::session(self.config);
                     fresh.begin_at(self.hello.next);
-                    self.mirror.renew(Arc::new(fresh));
+                    self.mirror.renew(fresh);
                 }
                 self.session = Some(session);
                 tracing::info!(servant, resumed, "linked to {}", self.config.server);

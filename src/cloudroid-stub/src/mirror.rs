@@ -29,9 +29,10 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
+use budget::Permit;
 use link::control::{Exit, FromCloud, Graph};
 use link::drops::{Cause, Drops};
-use link::record::Record;
+use link::record::{Called, Record};
 use link::{Handler, RobotSession};
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{Bus, NodeNames, ParamValue, WireType};
@@ -71,10 +72,10 @@ pub struct Mirror {
     /// What is registered here; locked while it is changed.
     applied: tokio::sync::Mutex<Applied>,
     /// Definitions by name and md5.
-    types: Mutex<HashMap<(String, String), WireType>>,
+    types: Mutex<HashMap<(String, String), KnownType>>,
     siblings: RwLock<BTreeSet<String>>,
     exit: watch::Sender<Option<Exit>>,
-    orders: mpsc::UnboundedSender<FromCloud>,
+    orders: mpsc::UnboundedSender<(FromCloud, Permit)>,
 }
 
 impl Mirror {
@@ -151,7 +152,7 @@ impl Mirror {
             return WireType::any();
         }
         let key = (name.to_owned(), md5.to_owned());
-        let known = self.types.lock().get(&key).cloned();
+        let known = self.types.lock().get(&key).map(|known| known.of.clone());
         known.unwrap_or_else(|| WireType::new(name, md5, "").written_by(self.bus.version()))
     }
 
@@ -189,7 +190,7 @@ impl Handler<FromCloud> for Mirror {
         }
     }
 
-    fn record(&self, record: Record<FromCloud>, arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, held: Permit, arrived: i64) {
         match record {
             Record::Data(data) => self.outputs.take(self, data, arrived),
             Record::Answer {
@@ -205,13 +206,31 @@ impl Handler<FromCloud> for Mirror {
                 id,
                 service,
                 request,
-            } => self.lent.call(self, service, request, (id, arrived)),
+            } => self.lent.call(
+                self,
+                Called {
+                    id,
+                    service,
+                    request,
+                    held,
+                    taken: arrived,
+                },
+            ),
             Record::Control(FromCloud::Line { error: true, text }) => eprintln!("{text}"),
             Record::Control(FromCloud::Line { text, .. }) => println!("{text}"),
-            Record::Control(FromCloud::Lookup { service }) => self.lent.look_up(self, service),
-            Record::Control(order) => drop(self.orders.send(order)),
+            Record::Control(FromCloud::Lookup { service }) => {
+                self.lent.look_up(self, service, held);
+            }
+            Record::Control(order) => drop(self.orders.send((order, held))),
         }
     }
+}
+
+/// A type by its name and hash, with its definition.
+struct KnownType {
+    of: WireType,
+    /// One that the server told counts as the server's: there is no end to what it may tell.
+    _held: Option<Permit>,
 }
 
 /// What the cloud has told to register.
@@ -266,8 +285,8 @@ async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
 }
 
 /// Does what the cloud tells, one thing after the other.
-async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<FromCloud>) {
-    while let Some(order) = orders.recv().await {
+async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<(FromCloud, Permit)>) {
+    while let Some((order, held)) = orders.recv().await {
         let Some(mirror) = mirror.upgrade() else {
             return;
         };
@@ -279,8 +298,11 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<FromClou
             } => {
                 let key = (name.clone(), md5.clone());
                 let wire_type = WireType::new(name, md5, definition);
-                let wire_type = wire_type.written_by(mirror.bus.version());
-                mirror.types.lock().insert(key, wire_type);
+                let known = KnownType {
+                    of: wire_type.written_by(mirror.bus.version()),
+                    _held: Some(held),
+                };
+                mirror.types.lock().insert(key, known);
             }
             FromCloud::Graph(graph) => mirror.apply(graph).await,
             FromCloud::Parameters(changes) => parameters::change(&mirror, changes).await,

@@ -8,10 +8,11 @@
 //! ```
 
 use std::process::ExitCode;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use budget::Budget;
 use futures_util::FutureExt;
 use link::control::{Exit, Hello, Sla};
 use link::{RobotSession, SessionOptions};
@@ -153,7 +154,7 @@ async fn begin(
         );
     }
     let shutdown = bus.shutdown_requested();
-    let session = Arc::new(RobotSession::new(session_options(&config)));
+    let session = session(&config);
     let label = format!("{} for {}", config.service, config.robot());
     if let Ok(lending) = bus.lending() {
         lending.set_label(&label);
@@ -296,8 +297,17 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
     }
 }
 
+/// Memory for what the server sends: what is under way, and what it tells until that is done. No server takes more of the robot's.
+pub static FROM_SERVER: LazyLock<Budget> =
+    LazyLock::new(|| Budget::new("what the server sends", 256 << 20));
+
+/// A session with the cloud that no connection carries yet.
+pub fn session(config: &Config) -> Arc<RobotSession> {
+    Arc::new(RobotSession::new(session_options(config)).within(&FROM_SERVER))
+}
+
 /// How the link is watched.
-pub fn session_options(config: &Config) -> SessionOptions {
+fn session_options(config: &Config) -> SessionOptions {
     let max = config
         .longest()
         .and_then(|max| Duration::try_from_secs_f64(max).ok());

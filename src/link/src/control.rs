@@ -1,5 +1,7 @@
 //! What the two ends tell each other beside messages and calls: JSON, since it is seldom and will grow. Fields unknown
 //! to a reader are ignored, those absent have a default, so a minor addition needs no new version.
+//!
+//! Lists are read up to a number of entries, since one of many small ones takes much more memory than its text.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,6 +10,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::drops::Drop;
+use crate::{MAX_CONTROL, MAX_FRAME, bounded};
 
 /// The robot's first frame on every connection.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -37,6 +40,7 @@ pub struct Hello {
     /// What the robot's application promises itself.
     pub sla: Sla,
     /// Codecs that the robot decodes; none: messages come as they are.
+    #[serde(deserialize_with = "bounded::list::<_, _, 256>")]
     pub codecs: Vec<String>,
     /// Quality of JPEG pictures, 1 to 100; 80 where absent.
     pub quality: Option<u8>,
@@ -49,6 +53,32 @@ pub struct Hello {
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
+impl Hello {
+    /// Bytes of its texts and lists, without the parameters.
+    pub fn own_bytes(&self) -> usize {
+        let node = &self.node;
+        let texts = [
+            &self.version,
+            &self.run,
+            &self.machine,
+            &self.host,
+            &self.roscore,
+            &node.name,
+            &node.package,
+            &node.executable,
+            &node.namespace,
+            &node.share,
+            &node.directory,
+            &node.image,
+        ];
+        let resume = self.resume.as_ref();
+        let texts = texts.into_iter().chain(&node.argv).chain(&self.codecs);
+        let texts = texts.chain(resume.map(|resume| &resume.session));
+        let ahead = resume.map_or(0, |resume| size_of_val(&resume.ahead[..]));
+        ahead + texts.map(String::len).sum::<usize>()
+    }
+}
+
 /// What the robot has of an earlier connection.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -58,6 +88,7 @@ pub struct Resume {
     /// All numbers up to this one have come.
     pub received: u64,
     /// Numbers above that which have come, too.
+    #[serde(deserialize_with = "bounded::list::<_, _, 65536>")]
     pub ahead: Vec<u64>,
 }
 
@@ -72,6 +103,7 @@ pub struct Node {
     /// The executable below its libexec directory.
     pub executable: String,
     /// Arguments, remaps and private parameters; nothing that begins with `__` in ROS 1.
+    #[serde(deserialize_with = "bounded::list::<_, _, 4096>")]
     pub argv: Vec<String>,
     /// All that the robot calls the program's nodes stands in `argv`; `name` is what the first of them is called then. Else all of them are called so, as
     /// by earlier stubs of ROS 2 and in ROS 1, where it is one.
@@ -123,11 +155,12 @@ pub enum Welcome {
         /// What the cloud has of the robot's numbers.
         received: u64,
         /// Numbers above that which it has, too.
+        #[serde(deserialize_with = "bounded::list::<_, _, 65_536>")]
         ahead: Vec<u64>,
         /// The first number that the cloud will use on this connection.
         next: u64,
         /// Codecs that the cloud decodes.
-        #[serde(default)]
+        #[serde(default, deserialize_with = "bounded::list::<_, _, 256>")]
         codecs: Vec<String>,
         /// The servant, for logs.
         servant: String,
@@ -167,7 +200,7 @@ pub enum FromRobot {
         signal: i32,
     },
     /// How a request went, for the cloud's statistics.
-    Requests(Vec<Request>),
+    Requests(#[serde(deserialize_with = "bounded::list::<_, _, 4096>")] Vec<Request>),
     /// What it has under that name. Control as an answer, and when what was there is gone.
     Lent {
         /// The name.
@@ -176,7 +209,7 @@ pub enum FromRobot {
         of: Option<Served>,
     },
     /// All messages that were dropped on its side so far.
-    Dropped(Vec<Drop>),
+    Dropped(#[serde(deserialize_with = "bounded::list::<_, _, 10000>")] Vec<Drop>),
     /// Messages of this session that it has not sent, so far.
     Unsent {
         /// Messages that a newer one replaced.
@@ -185,9 +218,9 @@ pub enum FromRobot {
         stale: u64,
     },
     /// What was decided about the local original, for the cloud's events, oldest first.
-    Decided(Vec<Decision>),
+    Decided(#[serde(deserialize_with = "bounded::list::<_, _, 1024>")] Vec<Decision>),
     /// All ends on the robot with which no messages pass now.
-    Refused(Vec<Refused>),
+    Refused(#[serde(deserialize_with = "bounded::list::<_, _, 1024>")] Vec<Refused>),
 }
 
 /// What the cloud tells a robot.
@@ -248,6 +281,14 @@ pub(crate) enum Control<O> {
     Order(O),
     /// For the session itself.
     Between(Between),
+}
+
+/// Bytes of a control record, at most: of parameters, which may be long texts, and of anything else.
+pub(crate) fn longest(json: &[u8]) -> usize {
+    if json.starts_with(b"{\"parameters\"") {
+        return MAX_FRAME;
+    }
+    MAX_CONTROL
 }
 
 impl<O: DeserializeOwned> Control<O> {
@@ -368,12 +409,16 @@ pub struct Qos {
 #[serde(default)]
 pub struct Graph {
     /// What it publishes.
+    #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
     pub outputs: Vec<Output>,
     /// What it subscribes to.
+    #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
     pub inputs: Vec<Wanted>,
     /// What it serves.
+    #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
     pub services: Vec<Served>,
     /// Other nodes of the same servant: what they publish on the robot is not sent up again.
+    #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
     pub siblings: Vec<String>,
     /// Which of all this is whose, by the nodes' names, where the program is several nodes (ROS 2). Stubs that do not know it have it all for their
     /// own node.
@@ -463,7 +508,10 @@ pub struct Served {
     /// Its hash.
     pub md5: String,
     /// The hashes of its requests and responses, where ends tell those of each other (ROS 2); else empty.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "bounded::list::<_, _, 16>"
+    )]
     pub halves: Vec<String>,
 }
 

@@ -6,7 +6,8 @@ use budget::{Budget, Permit};
 use bytes::{Bytes, BytesMut};
 
 use crate::frame::Received;
-use crate::{Error, MAX_RECORD};
+use crate::record::is_control;
+use crate::{Error, MAX_FRAME, MAX_RECORD};
 
 /// Records under way at once.
 const MAX_STREAMS: usize = 256;
@@ -98,6 +99,9 @@ impl Incoming {
         if total > MAX_RECORD {
             return Err(too_much("a record", total, MAX_RECORD));
         }
+        if is_control(bytes) && total > MAX_FRAME {
+            return Err(too_much("a control record", total, MAX_FRAME));
+        }
         if self.streams.len() >= MAX_STREAMS {
             return Err(too_much(
                 "records under way",
@@ -177,7 +181,7 @@ impl Incoming {
     }
 }
 
-fn too_much(what: &'static str, bytes: usize, limit: usize) -> Error {
+pub(crate) fn too_much(what: &'static str, bytes: usize, limit: usize) -> Error {
     Error::TooMuch {
         what,
         bytes: bytes as u64,

@@ -19,10 +19,12 @@
 
 #![forbid(unsafe_code)]
 
+mod bounded;
 pub mod clock;
 pub mod control;
 mod declared;
 pub mod drops;
+mod echoes;
 pub mod frame;
 mod incoming;
 mod outgoing;
@@ -33,6 +35,7 @@ pub mod skew;
 mod values;
 
 pub use drops::Dropped;
+pub use echoes::Echoes;
 pub use outgoing::Quality;
 pub use session::{CloudSession, Handler, Lost, RobotSession, Session, SessionOptions};
 
@@ -55,6 +58,10 @@ pub const SUBPROTOCOLS: &str = "cloudroid-link.";
 pub const MAX_FRAME: usize = 32 << 20;
 /// The longest record.
 pub const MAX_RECORD: usize = 256 << 20;
+/// The longest control record but those of parameters, which may be as long as a frame; and the longest hello, without its parameters.
+pub const MAX_CONTROL: usize = 1 << 20;
+/// What control records of one session take in memory at once, at most: those that were read and wait to be obeyed.
+pub const MAX_TOLD: usize = 64 << 20;
 
 /// What can go wrong with a peer.
 #[derive(Debug, thiserror::Error)]

@@ -7,6 +7,7 @@
 //! | 2 call | id u32 · service u32 · request |
 //! | 3 answer | id u32 · ok u8 · taken i64 · given i64 · response, or why not |
 
+use budget::Permit;
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 
 use crate::Error;
@@ -54,6 +55,21 @@ pub enum Record<C = Bytes> {
     },
 }
 
+/// A call that has come.
+#[derive(Debug)]
+pub struct Called {
+    /// Chosen by the caller's end.
+    pub id: u32,
+    /// The channel of the service.
+    pub service: u32,
+    /// Serialized.
+    pub request: Bytes,
+    /// It counts as the other end's until it is answered.
+    pub held: Permit,
+    /// When it had come as a whole (nanoseconds since 1970).
+    pub taken: i64,
+}
+
 /// A message of a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Data {
@@ -90,11 +106,22 @@ pub struct Answered {
     pub given: i64,
 }
 
+/// Whether a record that begins so is a control record.
+pub(crate) fn is_control(bytes: &[u8]) -> bool {
+    bytes.first() == Some(&CONTROL)
+}
+
 impl Record {
     /// The same with the order that `read` makes of its JSON; none where that makes none.
-    pub(crate) fn read<C>(self, read: impl FnOnce(Bytes) -> Option<C>) -> Option<Record<C>> {
-        Some(match self {
-            Record::Control(json) => Record::Control(read(json)?),
+    pub(crate) fn read<C, E>(
+        self,
+        read: impl FnOnce(Bytes) -> Result<Option<C>, E>,
+    ) -> Result<Option<Record<C>>, E> {
+        Ok(Some(match self {
+            Record::Control(json) => match read(json)? {
+                Some(order) => Record::Control(order),
+                None => return Ok(None),
+            },
             Record::Data(data) => Record::Data(data),
             Record::Call {
                 id,
@@ -116,7 +143,7 @@ impl Record {
                 given,
                 response,
             },
-        })
+        }))
     }
 
     /// Head and payload, in this order on the wire.

@@ -10,14 +10,13 @@ use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
-use budget::Budget;
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use tokio::time::{Instant, timeout};
 
-use crate::Error;
 use crate::clock::{Clock, Sample, now};
 use crate::control::{Between, FromCloud, FromRobot, Order};
 use crate::drops::{Cause, Drop, Dropped, Tally};
@@ -26,6 +25,7 @@ use crate::incoming::Incoming;
 use crate::outgoing::{Outgoing, Quality};
 use crate::packing::Packing;
 use crate::record::{Data, Record};
+use crate::{Error, MAX_TOLD, control};
 
 pub use opening::{receive_open, send_open};
 use throughput::{Counters, Throughput};
@@ -34,6 +34,12 @@ use throughput::{Counters, Throughput};
 const SHORTEST: Duration = Duration::from_millis(50);
 /// A connection is given up after so much silence, at least and at most.
 const LOST: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(20));
+
+/// What errors call the memory for orders.
+const TOLD: &str = "what the other end of a link tells";
+
+/// And the memory for calls, half of a session's: what is under way has room beside them.
+const CALLED: &str = "calls of the other end of a link";
 
 /// How a session's connections are watched.
 #[derive(Debug, Clone)]
@@ -90,10 +96,24 @@ pub enum Lost {
     Full(String),
 }
 
+impl Lost {
+    /// What the other end is told, where it can still be told something: a WebSocket close code and the reason.
+    pub fn goodbye(&self) -> Option<(u16, String)> {
+        match self {
+            Lost::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
+            Lost::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
+            Lost::Protocol(error) => Some((1002, error.to_string())),
+            Lost::Full(_) => Some((1013, self.to_string())),
+            _ => None,
+        }
+    }
+}
+
 /// Takes what comes from an end that gives orders `O`.
 pub trait Handler<O>: Sync {
-    /// A record, and when it had come as a whole (nanoseconds since 1970). Must not block.
-    fn record(&self, record: Record<O>, arrived: i64);
+    /// A record, and when it had come as a whole (nanoseconds since 1970). An order or call counts in the session's budget until `held` is
+    /// dropped: it is kept until the order is obeyed, the call answered. Must not block.
+    fn record(&self, record: Record<O>, held: Permit, arrived: i64);
     /// A message of this channel came that cannot be decoded.
     fn undecodable(&self, channel: u32) {
         let _ = channel;
@@ -120,6 +140,10 @@ pub struct Session<O> {
     /// Pongs so far.
     pongs: watch::Sender<u64>,
     next_call: AtomicU32,
+    /// Where the peer's orders count until they are obeyed.
+    told: Budget,
+    /// Where its calls count until they are answered.
+    called: Budget,
     orders: PhantomData<fn(O)>,
 }
 
@@ -175,13 +199,18 @@ impl<O: Order> Session<O> {
             asked: AtomicBool::new(false),
             pongs: watch::Sender::new(0),
             next_call: AtomicU32::new(1),
+            told: Budget::new(TOLD, MAX_TOLD),
+            called: Budget::unlimited(),
             orders: PhantomData,
         }
     }
 
-    /// Counts records that are arriving in `budget`; one that does not fit ends its connection. Counts what waits for the peer,
+    /// Counts records that are arriving in `budget`, and orders until they are obeyed; one that does not fit ends its connection. Counts
+    /// calls until they are answered; one that does not fit fails. Counts what waits for the peer,
     /// too: messages that do not fit are dropped, a call or answer that does not fit ends the session.
-    pub fn within(self, budget: &Budget) -> Self {
+    pub fn within(mut self, budget: &Budget) -> Self {
+        self.told = budget.within(TOLD, MAX_TOLD);
+        self.called = budget.within(CALLED, budget.most() / 2);
         {
             let mut state = self.state.lock();
             state.incoming = Incoming::within(budget);
@@ -264,6 +293,16 @@ impl<O: Order> Session<O> {
 
     fn control(&self, told: &impl Serialize) {
         let json = serde_json::to_vec(told).unwrap_or_default();
+        let (bytes, limit) = (json.len(), control::longest(&json));
+        if bytes > limit {
+            // The peer would end the link.
+            tracing::warn!(
+                bytes,
+                limit,
+                "something is too long to be told to the other end of the link"
+            );
+            return;
+        }
         self.push(&Record::Control(json.into()), Quality::Each);
     }
 

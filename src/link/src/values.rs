@@ -6,81 +6,67 @@ use std::collections::BTreeMap;
 
 use base64_simd::STANDARD;
 use ros::bus::ParamValue;
+use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use crate::bounded;
+
+/// The member of a map that is a double which JSON cannot write.
+const DOUBLE: &str = "~double";
+/// The member of a map that is bytes.
+const BYTES: &str = "~base64";
+
+/// Changes that are told at once, at most.
+const MOST_CHANGES: usize = 50_000;
+
 /// A value as it is written.
-#[derive(Serialize, Deserialize)]
-#[serde(untagged)]
-enum Written {
-    Bool(bool),
-    Int(i64),
-    Double(f64),
-    String(String),
-    List(Vec<Written>),
-    Spelt(Spelt),
-    Bytes(Bytes),
-    Map(BTreeMap<String, Written>),
-}
+struct Written<'a>(&'a ParamValue);
 
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Spelt {
-    #[serde(rename = "~double")]
-    double: String,
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Bytes {
-    #[serde(rename = "~base64")]
-    base64: String,
-}
-
-impl From<&ParamValue> for Written {
-    fn from(value: &ParamValue) -> Self {
-        match value {
-            ParamValue::Bool(truth) => Self::Bool(*truth),
-            ParamValue::Int(number) => Self::Int(*number),
-            ParamValue::Double(number) if number.is_finite() => Self::Double(*number),
-            ParamValue::Double(number) => Self::Spelt(Spelt {
-                double: number.to_string(),
-            }),
-            ParamValue::String(text) => Self::String(text.clone()),
+impl Serialize for Written<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self.0 {
+            ParamValue::Bool(truth) => serializer.serialize_bool(*truth),
+            ParamValue::Int(number) => serializer.serialize_i64(*number),
+            ParamValue::Double(number) if number.is_finite() => serializer.serialize_f64(*number),
+            ParamValue::Double(number) => serializer.collect_map([(DOUBLE, number.to_string())]),
+            ParamValue::String(text) => serializer.serialize_str(text),
             // Stubs leave it out, and say so.
-            ParamValue::Nil => Self::String(String::new()),
-            ParamValue::Binary(bytes) => Self::Bytes(Bytes {
-                base64: STANDARD.encode_to_string(bytes),
-            }),
-            ParamValue::List(items) => Self::List(items.iter().map(Self::from).collect()),
+            ParamValue::Nil => serializer.serialize_str(""),
+            ParamValue::Binary(bytes) => {
+                serializer.collect_map([(BYTES, STANDARD.encode_to_string(bytes))])
+            }
+            ParamValue::List(items) => serializer.collect_seq(items.iter().map(Written)),
             ParamValue::Map(members) => {
-                let members = members.iter();
-                Self::Map(
-                    members
-                        .map(|(key, value)| (key.clone(), value.into()))
-                        .collect(),
-                )
+                serializer.collect_map(members.iter().map(|(name, value)| (name, Written(value))))
             }
         }
     }
 }
 
-impl From<Written> for ParamValue {
-    fn from(written: Written) -> Self {
-        match written {
-            Written::Bool(truth) => Self::Bool(truth),
-            Written::Int(number) => Self::Int(number),
-            Written::Double(number) => Self::Double(number),
-            Written::Spelt(spelt) => Self::Double(spelt.double.parse().unwrap_or(f64::NAN)),
-            Written::Bytes(bytes) => {
-                Self::Binary(STANDARD.decode_to_vec(bytes.base64).unwrap_or_default())
-            }
-            Written::String(text) => Self::String(text),
-            Written::List(items) => Self::List(items.into_iter().map(Self::from).collect()),
-            Written::Map(members) => {
-                let members = members.into_iter();
-                Self::Map(members.map(|(key, value)| (key, value.into())).collect())
-            }
-        }
+/// Takes a value from how it was written, in its place: maps that spell a double or bytes become those.
+fn take_written(value: &mut ParamValue) {
+    match value {
+        ParamValue::List(items) => items.iter_mut().for_each(take_written),
+        ParamValue::Map(members) => match spelt(members) {
+            Some(spelt) => *value = spelt,
+            None => members.values_mut().for_each(take_written),
+        },
+        _ => {}
+    }
+}
+
+/// The double or the bytes that a map of one member spells.
+fn spelt(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
+    let (name, ParamValue::String(text)) = members.first_key_value()? else {
+        return None;
+    };
+    match name.as_str() {
+        _ if members.len() > 1 => None,
+        DOUBLE => Some(ParamValue::Double(text.parse().unwrap_or(f64::NAN))),
+        BYTES => Some(ParamValue::Binary(
+            STANDARD.decode_to_vec(text).unwrap_or_default(),
+        )),
+        _ => None,
     }
 }
 
@@ -92,17 +78,20 @@ pub(crate) mod tree {
         tree: &BTreeMap<String, ParamValue>,
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(tree.iter().map(|(key, value)| (key, Written::from(value))))
+        serializer.collect_map(tree.iter().map(|(key, value)| (key, Written(value))))
     }
 
     pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<BTreeMap<String, ParamValue>, D::Error> {
-        let tree = BTreeMap::<String, Written>::deserialize(deserializer)?;
-        Ok(tree
-            .into_iter()
-            .map(|(key, value)| (key, value.into()))
-            .collect())
+        // One value, so that the bounds of one hold for all of them.
+        match ParamValue::deserialize(deserializer)? {
+            ParamValue::Map(mut tree) => {
+                tree.values_mut().for_each(take_written);
+                Ok(tree)
+            }
+            _ => Err(D::Error::custom("parameters are a map")),
+        }
     }
 }
 
@@ -115,17 +104,17 @@ pub(crate) mod changes {
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
         let written = changes.iter();
-        serializer.collect_seq(written.map(|(key, value)| (key, value.as_ref().map(Written::from))))
+        serializer.collect_seq(written.map(|(key, value)| (key, value.as_ref().map(Written))))
     }
 
     pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<Vec<(String, Option<ParamValue>)>, D::Error> {
-        let changes = Vec::<(String, Option<Written>)>::deserialize(deserializer)?;
-        let changes = changes.into_iter();
-        Ok(changes
-            .map(|(key, value)| (key, value.map(ParamValue::from)))
-            .collect())
+        let mut changes =
+            bounded::list::<_, (String, Option<ParamValue>), MOST_CHANGES>(deserializer)?;
+        let values = changes.iter_mut().filter_map(|(_, value)| value.as_mut());
+        values.for_each(take_written);
+        Ok(changes)
     }
 }
 

@@ -48,7 +48,7 @@ use link::control::{FromCloud, Hello, Sla, Welcome};
 use link::packing::decoded_here;
 use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
-use link::{MAX_FRAME, MAX_RECORD};
+use link::{MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 
 use crate::Flow;
 use attempts::Attempts;
@@ -58,6 +58,8 @@ pub use nodes::Nodes;
 pub use status::LinkStatus;
 use turns::Turns;
 
+/// What errors call the memory for hellos.
+const GREETING: &str = "a robot's hello";
 /// For the robot's hello.
 const HELLO: Duration = Duration::from_secs(10);
 /// For a node of an earlier run to end, before it is killed, and after that.
@@ -191,11 +193,21 @@ impl Hub {
     {
         let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD)
             .within(&self.options.budget, self.options.unfinished);
-        let hello: Hello = match timeout(HELLO, receive_open(&mut socket, "hello")).await {
+        let mut held = self.options.budget.within(GREETING, MAX_TOLD).permit();
+        let opening = receive_open(&mut socket, "hello", &mut held);
+        let mut hello: Hello = match timeout(HELLO, opening).await {
             Ok(Ok(hello)) => hello,
-            Ok(Err(lost)) => return lost,
+            Ok(Err(lost)) => return refused(&mut socket, lost).await,
             Err(_) => return Lost::Silent(HELLO),
         };
+        if hello.own_bytes() > MAX_CONTROL {
+            let error = link::Error::TooMuch {
+                what: "a hello without parameters",
+                bytes: hello.own_bytes() as u64,
+                limit: MAX_CONTROL as u64,
+            };
+            return refused(&mut socket, Lost::Protocol(error)).await;
+        }
         let name = hello.node.name.clone();
         let (link, resumed, turn) = match self.attach(&hello).await {
             Ok(attached) => attached,
@@ -219,6 +231,9 @@ impl Hub {
                 };
             }
         };
+        // They have been set in the servant: what is kept of a hello is small.
+        hello.parameters.clear();
+        drop(held);
         // Whoever comes later than this one takes its place, while it waits for the lease, too.
         let mut kicked = link.kick.subscribe();
         let replaced = kicked.wait_for(|kicks| *kicks != turn);
@@ -473,6 +488,18 @@ impl Refusal {
             again: false,
         }
     }
+}
+
+/// Tells a robot why its hello is not read.
+async fn refused<S>(socket: &mut WebSocket<S>, lost: Lost) -> Lost
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    if let Some((code, reason)) = lost.goodbye() {
+        socket.queue_close(code, &reason);
+        let _ = timeout(Duration::from_secs(1), socket.leave(true)).await;
+    }
+    lost
 }
 
 fn replaced_by_another() -> Lost {

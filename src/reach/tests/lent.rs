@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::clock::now;
 use link::control::{Exit, FromCloud, FromRobot, Hello, Node, Served, Welcome};
@@ -87,7 +88,7 @@ enum Told {
 struct Ear(mpsc::UnboundedSender<Told>);
 
 impl Handler<FromCloud> for Ear {
-    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
             Record::Call {
                 id,
@@ -149,7 +150,10 @@ impl Robot {
             (resume.received, resume.ahead) = (have, ahead);
         }
         send_open(&mut socket, &self.hello).await.unwrap();
-        let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+        let mut held = Budget::unlimited().permit();
+        let welcome = receive_open(&mut socket, "welcome", &mut held)
+            .await
+            .unwrap();
         let Welcome::Accepted {
             session,
             received,

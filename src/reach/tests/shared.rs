@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bridge::BridgeOptions;
-use budget::Budget;
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, Node, Request, Welcome};
 use link::record::Record;
@@ -157,7 +157,7 @@ enum Told {
 struct Ear(mpsc::UnboundedSender<Told>);
 
 impl Handler<FromCloud> for Ear {
-    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
             Record::Answer { id, response, .. } => Told::Answer(id, response),
             Record::Control(FromCloud::Graph(graph)) => Told::Graph(graph),
@@ -213,7 +213,10 @@ async fn says(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexStream>
     tokio::spawn(async move { reach.serve_link(Box::new(theirs), &[]).await });
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
-    let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+    let mut held = Budget::unlimited().permit();
+    let welcome = receive_open(&mut socket, "welcome", &mut held)
+        .await
+        .unwrap();
     (socket, welcome)
 }
 

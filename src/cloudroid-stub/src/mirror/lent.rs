@@ -5,9 +5,10 @@ use std::collections::HashMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Weak};
 
-use bytes::Bytes;
+use budget::Permit;
 use link::RobotSession;
 use link::control::{FromRobot, Served};
+use link::record::Called;
 use parking_lot::Mutex;
 use ros::bus::{BusError, CallFate, Digest, Graph, ServiceProvider};
 
@@ -34,10 +35,11 @@ impl LentServices {
         self.services.lock().clear();
     }
 
-    /// The cloud asks for a service. It is told in any case.
-    pub fn look_up(&self, mirror: &Mirror, service: String) {
+    /// The cloud asks for a service. It is told in any case; what it asks counts as its own until then.
+    pub fn look_up(&self, mirror: &Mirror, service: String, held: Permit) {
         let (this, session) = (mirror.this.clone(), mirror.session());
         tokio::spawn(async move {
+            let _held = held;
             let Some(mirror) = this.upgrade() else { return };
             let found = async { mirror.bus.lending()?.provider(&service).await }.await;
             let found = found.map_err(|error| error.to_string());
@@ -86,8 +88,15 @@ impl LentServices {
         session.report(&FromRobot::Lent { service, of });
     }
 
-    /// Calls on behalf of the cloud; `id` and `arrived` are the call's.
-    pub fn call(&self, mirror: &Mirror, channel: u32, request: Bytes, (id, arrived): (u32, i64)) {
+    /// Calls on behalf of the cloud; the request counts as the cloud's until it is answered.
+    pub fn call(&self, mirror: &Mirror, call: Called) {
+        let Called {
+            id,
+            service: channel,
+            request,
+            held,
+            taken: arrived,
+        } = call;
         let session = mirror.session();
         let known = {
             let services = self.services.lock();
@@ -102,6 +111,7 @@ impl LentServices {
         };
         let this = mirror.this.clone();
         tokio::spawn(async move {
+            let _held = held;
             let Some(mirror) = this.upgrade() else { return };
             let limit = local::limit(&name, mirror.call_limit);
             let called = mirror.bus.call_typed(&name, &digest, request, limit).await;
@@ -201,6 +211,7 @@ mod tests {
     use std::time::Duration;
 
     use async_trait::async_trait;
+    use bytes::Bytes;
     use link::SessionOptions;
     use ros::bus::{Bus, Lending, ServiceHandler, ServiceType};
     use ros::net::HostSockets;

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use link::Echoes;
 use link::control::FromRobot;
-use parking_lot::Mutex;
 use ros::bus::{ParamChange, ParamValue};
 
 use super::Mirror;
@@ -14,19 +14,13 @@ use ros::ros1::own_parameters::is_of_master;
 /// What was set here in the cloud's name: it does not go back.
 #[derive(Default)]
 pub struct Parameters {
-    set: Mutex<BTreeMap<String, ParamValue>>,
+    set: Echoes,
 }
 
 impl Parameters {
     fn is_news(&self, key: &str, value: Option<&ParamValue>) -> bool {
-        let own = is_of_master(key);
-        let mut set = self.set.lock();
-        let echo = set.get(key) == value;
-        if !echo {
-            set.remove(key);
-        }
-        let echo = echo && value.is_some();
-        !own && !echo
+        let is_echo = self.set.is_echo(key, value) && value.is_some();
+        !is_of_master(key) && !is_echo
     }
 }
 
@@ -80,12 +74,12 @@ pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
     for (key, value) in changes {
         let done = match value {
             Some(value) => {
-                mirror
-                    .parameters
-                    .set
-                    .lock()
-                    .insert(key.clone(), value.clone());
-                parameters.set(&key, value).await
+                mirror.parameters.set.expect(&key, &value);
+                let done = parameters.set(&key, value).await;
+                if done.is_err() {
+                    mirror.parameters.set.forget(&key);
+                }
+                done
             }
             None => parameters.delete(&key).await,
         };

@@ -6,8 +6,8 @@ use std::sync::{Arc, Weak};
 use link::control::{self, Graph, Output, Served, Wanted};
 use ros::bus::{Qos, ServiceType, WireType};
 
-use super::Mirror;
 use super::outputs::NOWHERE;
+use super::{KnownType, Mirror};
 use crate::local::{Keeper, Original, Registered};
 
 /// Registers on the robot what the local original registers, until the cloud has said what the node registers.
@@ -41,7 +41,8 @@ impl Mirror {
         let types = registered.outputs.iter().chain(&registered.inputs);
         for (_, wire_type, _) in types.filter(|(_, of, _)| !of.definition.is_empty()) {
             let key = (wire_type.name.clone(), wire_type.digest.to_string());
-            self.types.lock().insert(key, wire_type.clone());
+            let (of, _held) = (wire_type.clone(), None);
+            self.types.lock().insert(key, KnownType { of, _held });
         }
         let told = |qos: Option<Qos>| qos.as_ref().map(control::Qos::of);
         let output = |(topic, of, qos): (String, WireType, Option<Qos>)| Output {

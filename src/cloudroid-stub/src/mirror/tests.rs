@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::Budget;
 use bytes::Bytes;
 use futures_util::FutureExt;
 use link::control::{self, Exit, Hello, Node, Output, Welcome};
@@ -157,7 +158,10 @@ impl Scene {
             ..Hello::default()
         };
         send_open(&mut socket, &hello).await.unwrap();
-        let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+        let mut held = Budget::unlimited().permit();
+        let welcome = receive_open(&mut socket, "welcome", &mut held)
+            .await
+            .unwrap();
         let Welcome::Accepted {
             received,
             ahead,
@@ -265,7 +269,12 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node(ros: RosVe
         qos: (ros == RosVersion::Two).then(|| control::Qos::of(&Qos::keep_last(1).latching(true))),
     };
     let key = (output.type_name.clone(), output.md5.clone());
-    scene.mirror.types.lock().insert(key, string_type(ros));
+    let (of, _held) = (string_type(ros), None);
+    scene
+        .mirror
+        .types
+        .lock()
+        .insert(key, KnownType { of, _held });
     let outputs = &scene.mirror.outputs;
     outputs.apply(&scene.mirror, &[output], false).await;
     let app = scene.robot.node("/app").await;

@@ -26,6 +26,8 @@ const LOW_WATER: usize = 24 * 1024;
 const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
 /// After so many messages in a row those who pass them on have their turn, or their queues would overflow.
 const IN_A_ROW: u32 = 32;
+/// Bytes that a call takes beside its request, until it is answered.
+const CALL: usize = 1024;
 /// Exchanges made at once on a new connection, to know the peer's clock.
 const FIRST_PINGS: u32 = 6;
 
@@ -43,11 +45,7 @@ impl<O: Order> Session<O> {
         self.up.send_replace(false);
         let goodbye = match &lost {
             Lost::Ended => self.state.lock().ending.clone(),
-            Lost::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
-            Lost::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
-            Lost::Protocol(error) => Some((1002, error.to_string())),
-            Lost::Full(_) => Some((1013, lost.to_string())),
-            _ => None,
+            lost => lost.goodbye(),
         };
         if let Some((code, reason)) = goodbye {
             socket.queue_close(code, &reason);
@@ -256,7 +254,9 @@ impl<O: Order> Session<O> {
             Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
         };
         if let Some(record) = record {
-            let understood = match Record::decode(record)? {
+            let mut held = self.told.permit();
+            let record = Record::decode(record)?;
+            let understood = match record {
                 Record::Data(data) => {
                     let channel = data.channel;
                     match self.unpacked(data) {
@@ -271,10 +271,22 @@ impl<O: Order> Session<O> {
                         }
                     }
                 }
-                record => record.read(|json| self.understood(&json)),
+                Record::Call {
+                    id, ref request, ..
+                } => match self.called.take(CALL + request.len()) {
+                    Ok(permit) => {
+                        held = permit;
+                        record.read(|_| Ok::<_, Error>(None))?
+                    }
+                    Err(full) => {
+                        self.answer(id, arrived, Err(full.to_string()));
+                        None
+                    }
+                },
+                record => record.read(|json| self.understood(&json, &mut held))?,
             };
             if let Some(record) = understood {
-                handler.record(record, arrived);
+                handler.record(record, held, arrived);
             }
         }
         let come = self.state.lock().incoming.received().bytes;

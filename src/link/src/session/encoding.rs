@@ -1,11 +1,14 @@
 //! What a slow link carries is made smaller on its way out, and as it was on its way in.
 
+use budget::{JsonWeight, Permit};
 use codec::Answer;
 use tokio::task::JoinHandle;
 
 use super::{Session, State};
-use crate::control::{Between, Control, Order};
+use crate::Error;
+use crate::control::{self, Between, Control, Order};
 use crate::frame::Frame;
+use crate::incoming::too_much;
 use crate::packing::Packed;
 use crate::record::Data;
 
@@ -81,16 +84,25 @@ impl<O: Order> Session<O> {
         tracing::warn!(topic, "a message came damaged at the other end{then}");
     }
 
-    /// What the peer orders, unless its session tells this one something.
-    pub(super) fn understood(&self, json: &[u8]) -> Option<O::OfPeer> {
+    /// What the peer orders, unless its session tells this one something. The order counts in `held`, from before it is read.
+    pub(super) fn understood(
+        &self,
+        json: &[u8],
+        held: &mut Permit,
+    ) -> Result<Option<O::OfPeer>, Error> {
+        let limit = control::longest(json);
+        if json.len() > limit {
+            return Err(too_much("a control record", json.len(), limit));
+        }
+        held.resize(JsonWeight::of(json).bytes)?;
         match Control::read(json) {
-            Ok(Control::Order(order)) => return Some(order),
+            Ok(Control::Order(order)) => return Ok(Some(order)),
             Ok(Control::Between(Between::Keyframe { channel })) => {
                 let packing = &mut self.state.lock().packing;
                 packing.answered(channel, Answer::Keyframe);
             }
             Err(error) => tracing::debug!(%error, "the other end tells something unknown"),
         }
-        None
+        Ok(None)
     }
 }

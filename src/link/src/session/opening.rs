@@ -2,6 +2,7 @@
 
 use std::future::poll_fn;
 
+use budget::{JsonWeight, Permit};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -25,8 +26,12 @@ where
         .map_err(|error| Lost::Socket(error.to_string()))
 }
 
-/// Reads the peer's opening frame; `what` it should be is for messages.
-pub async fn receive_open<S, T>(socket: &mut WebSocket<S>, what: &'static str) -> Result<T, Lost>
+/// Reads the peer's opening frame; `what` it should be is for messages. It counts in `held`, from before it is read.
+pub async fn receive_open<S, T>(
+    socket: &mut WebSocket<S>,
+    what: &'static str,
+    held: &mut Permit,
+) -> Result<T, Lost>
 where
     S: AsyncRead + AsyncWrite + Unpin,
     T: DeserializeOwned,
@@ -40,6 +45,8 @@ where
                 let Frame::Open(json) = Frame::decode(bytes)? else {
                     return Err(Error::Protocol("no opening frame").into());
                 };
+                let weight = JsonWeight::of(&json);
+                held.resize(weight.bytes).map_err(Error::from)?;
                 return serde_json::from_slice(&json).map_err(|error| {
                     let reason = error.to_string();
                     Error::Json { what, reason }.into()

@@ -15,7 +15,7 @@ type Session = RobotSession;
 struct To(mpsc::UnboundedSender<Record<FromCloud>>);
 
 impl Handler<FromCloud> for To {
-    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let _ = self.0.send(record);
     }
 }
@@ -415,7 +415,7 @@ struct Counting(
 );
 
 impl Handler<FromCloud> for Counting {
-    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let _ = self.0.send(record);
     }
     fn undecodable(&self, _channel: u32) {
@@ -472,4 +472,148 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
         }
     }
     assert_eq!(to_cloud.1.load(Ordering::Relaxed), 1, "it was told of");
+}
+
+/// Keeps orders, as one does who is slow to obey.
+#[derive(Default)]
+struct Slow(Mutex<Vec<(Record<FromCloud>, Permit)>>, Notify);
+
+impl Handler<FromCloud> for Slow {
+    fn record(&self, record: Record<FromCloud>, held: Permit, _arrived: i64) {
+        self.0.lock().push((record, held));
+        self.1.notify_one();
+    }
+}
+
+/// How the link ends at the end that is given orders, which may hold `limit` bytes.
+async fn told(limit: usize, orders: impl IntoIterator<Item = Bytes>) -> (Lost, usize, Budget) {
+    let budget = Budget::new("robot x", limit);
+    let told = Arc::new(
+        Arc::into_inner(session())
+            .expect("the only one")
+            .within(&budget),
+    );
+    let tells = session();
+    open(&told, &tells);
+    let (mut at_told, mut at_teller) = sockets();
+    for json in orders {
+        tells.push(&Record::Control(json), Quality::Each);
+    }
+    tells.end(1000, "all is told");
+    let (slow, nobody) = (Slow::default(), To(mpsc::unbounded_channel().0));
+    let (lost, _) = tokio::join!(
+        told.run(&mut at_told, &slow),
+        tells.run(&mut at_teller, &nobody)
+    );
+    let kept = slow.0.into_inner().len();
+    (lost, kept, budget)
+}
+
+#[tokio::test]
+async fn orders_count_until_they_are_obeyed() {
+    let line = Bytes::from_static(br#"{"line":{"error":false,"text":"a"}}"#);
+    let (lost, kept, budget) = told(1 << 20, vec![line.clone(); 100]).await;
+    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+    assert_eq!((kept, budget.used()), (100, 0));
+    let (lost, kept, _) = told(1 << 20, vec![line; 10_000]).await;
+    let Lost::Protocol(Error::Exceeded(_)) = lost else {
+        panic!("all of them wait at once: {lost}");
+    };
+    assert!((100..5000).contains(&kept), "{kept} were kept");
+}
+
+#[tokio::test]
+async fn an_order_is_as_long_as_it_may_be() {
+    let line = |length: usize| {
+        let text = "x".repeat(length);
+        Bytes::from(format!(r#"{{"line":{{"error":false,"text":"{text}"}}}}"#))
+    };
+    let (lost, kept, _) = told(64 << 20, [line(crate::MAX_CONTROL - 100)]).await;
+    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+    assert_eq!(kept, 1);
+    let (lost, kept, _) = told(64 << 20, [line(crate::MAX_CONTROL)]).await;
+    let Lost::Protocol(error @ Error::TooMuch { .. }) = lost else {
+        panic!("it is too long: {lost}");
+    };
+    assert!(
+        error.to_string().contains("a control record of 10486"),
+        "{error}"
+    );
+    assert_eq!(kept, 0);
+    // Parameters may be long texts.
+    let text = "x".repeat(4 << 20);
+    let parameters = format!(r#"{{"parameters":[["/robot_description","{text}"]]}}"#);
+    let (lost, kept, _) = told(64 << 20, [parameters.into()]).await;
+    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+    assert_eq!(kept, 1);
+}
+
+#[tokio::test]
+async fn parameters_are_read_if_what_they_become_has_room() {
+    // Each map of one member is seven bytes of text, and hundreds of memory.
+    let maps = vec![r#"{"a":1}"#; 100_000].join(",");
+    let parameters = Bytes::from(format!(r#"{{"parameters":[["/a",[{maps}]]]}}"#));
+    let (lost, kept, _) = told(usize::MAX, [parameters]).await;
+    let Lost::Protocol(Error::Exceeded(full)) = lost else {
+        panic!("it takes more than a session may: {lost}");
+    };
+    assert_eq!((kept, full.limit), (0, MAX_TOLD));
+}
+
+#[tokio::test]
+async fn a_hello_is_read_if_what_it_becomes_has_room() {
+    let (mut at_robot, mut at_cloud) = sockets();
+    let tree = vec![r#""a":{"b":1}"#; 10_000].join(",");
+    let hello = Bytes::from(format!(r#"{{"run":"r","parameters":{{{tree}}}}}"#));
+    let budget = Budget::new("robot x", 64 << 20);
+    for (limit, is_read) in [(64 << 20, true), (4 << 20, false)] {
+        at_robot.queue(ws::frame::BINARY, Frame::Open(hello.clone()).encode());
+        let mut held = budget.within("hello", limit).permit();
+        let hello = receive_open::<_, crate::control::Hello>(&mut at_cloud, "hello", &mut held);
+        let (sent, hello) = tokio::join!(poll_fn(|cx| at_robot.poll_flush(cx)), hello);
+        sent.expect("sent");
+        match hello {
+            Ok(hello) => assert!(is_read && hello.parameters.len() == 1),
+            Err(lost) => {
+                assert!(!is_read && lost.to_string().contains("hello"), "{lost}");
+            }
+        }
+        assert_eq!(held.bytes() > 0, is_read);
+    }
+}
+
+#[tokio::test]
+async fn calls_count_until_they_are_answered() {
+    // Half of it is for calls: what is under way shall not suffer from them.
+    let budget = Budget::new("robot x", 2 << 20);
+    let asked = Arc::new(
+        Arc::into_inner(session())
+            .expect("the only one")
+            .within(&budget),
+    );
+    let asks = session();
+    open(&asked, &asks);
+    let (mut at_asked, mut at_asking) = sockets();
+    for _ in 0..10 {
+        asks.call(1, vec![1; 200 << 10].into());
+    }
+    let (slow, (to, mut answers)) = (Slow::default(), mpsc::unbounded_channel());
+    let to = To(to);
+    let answered = async {
+        let Some(Record::Answer { response, .. }) = answers.recv().await else {
+            panic!("one does not fit");
+        };
+        response.expect_err("it does not fit")
+    };
+    let reason = tokio::select! {
+        lost = asked.run(&mut at_asked, &slow) => panic!("{lost}"),
+        lost = asks.run(&mut at_asking, &to) => panic!("{lost}"),
+        reason = answered => reason,
+    };
+    assert!(reason.contains("the memory for calls"), "{reason}");
+    let kept = slow.0.into_inner();
+    assert_eq!(kept.len(), 5);
+    assert!(budget.used() >= 5 * (200 << 10));
+    drop((kept, asked));
+    assert_eq!(budget.used(), 0);
 }

@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use budget::Permit;
 use parking_lot::Mutex;
 
 use super::node_link::NodeLink;
@@ -24,7 +25,7 @@ struct State {
     /// The things that are waited for, by number.
     holds: BTreeSet<u64>,
     next: u64,
-    records: Ring<Waiting>,
+    records: Ring<Arrival>,
     /// Someone passes on what had waited: others queue up behind.
     passing: bool,
 }
@@ -41,12 +42,18 @@ impl Default for State {
     }
 }
 
-/// A record, and when it came.
-struct Waiting(Record<FromRobot>, i64);
+/// A record that has come.
+pub(super) struct Arrival {
+    pub(super) record: Record<FromRobot>,
+    /// An order or call counts as the robot's until this is dropped.
+    pub(super) held: Permit,
+    /// When it had come (nanoseconds since 1970).
+    pub(super) at: i64,
+}
 
-impl ring::Held for Waiting {
+impl ring::Held for Arrival {
     fn held(&self) -> usize {
-        match &self.0 {
+        match &self.record {
             Record::Data(data) => data.message.len(),
             Record::Call { request, .. } => request.len(),
             _ => 0,
@@ -62,21 +69,17 @@ impl State {
 
 impl Held {
     /// Takes a record that must wait; gives back one that need not.
-    pub(super) fn take(
-        &self,
-        record: Record<FromRobot>,
-        arrived: i64,
-    ) -> Option<(Record<FromRobot>, i64)> {
+    pub(super) fn take(&self, arrival: Arrival) -> Option<Arrival> {
         let mut state = self.state.lock();
         if state.holds.is_empty() && !state.passing && state.records.is_empty() {
-            return Some((record, arrived));
+            return Some(arrival);
         }
-        state.records.append(Waiting(record, arrived));
+        state.records.append(arrival);
         None
     }
 
     /// Passes on what need not wait any longer, in order.
-    pub(super) fn pass(&self, mut to: impl FnMut(Record<FromRobot>, i64)) {
+    pub(super) fn pass(&self, mut to: impl FnMut(Arrival)) {
         let mut state = self.state.lock();
         if state.passing {
             return;
@@ -84,11 +87,11 @@ impl Held {
         state.passing = true;
         // Not while locked: `to` may take its time.
         while state.is_due() {
-            let Some(Waiting(record, arrived)) = state.records.pop() else {
+            let Some(arrival) = state.records.pop() else {
                 break;
             };
             drop(state);
-            to(record, arrived);
+            to(arrival);
             state = self.state.lock();
         }
         state.passing = false;
@@ -144,44 +147,47 @@ impl Drop for Hold {
 
 #[cfg(test)]
 mod tests {
+    use budget::Budget;
     use bytes::Bytes;
 
     use super::*;
 
-    fn call(id: u32, size: usize) -> Record<FromRobot> {
-        Record::Call {
-            id,
+    fn call(size: usize, at: i64) -> Arrival {
+        let record = Record::Call {
+            id: 0,
             service: 1,
             request: Bytes::from(vec![0; size]),
-        }
+        };
+        let held = Budget::unlimited().permit();
+        Arrival { record, held, at }
     }
 
     fn passed(held: &Held) -> Vec<i64> {
         let mut passed = Vec::new();
-        held.pass(|_, arrived| passed.push(arrived));
+        held.pass(|arrival| passed.push(arrival.at));
         passed
     }
 
     #[test]
     fn what_waits_passes_in_order_once_it_may() {
         let held = Held::default();
-        assert!(held.take(call(0, 1), 0).is_some(), "nothing to wait for");
+        assert!(held.take(call(1, 0)).is_some(), "nothing to wait for");
         let hold = held.hold();
         for number in 1..4 {
-            assert!(held.take(call(0, 1), number).is_none());
+            assert!(held.take(call(1, number)).is_none());
         }
         assert!(passed(&held).is_empty());
         held.release(hold);
         // One that comes while others pass does not overtake them.
         let mut order = Vec::new();
-        held.pass(|_, arrived| {
-            if arrived == 1 {
-                assert!(held.take(call(0, 1), 4).is_none());
+        held.pass(|arrival| {
+            if arrival.at == 1 {
+                assert!(held.take(call(1, 4)).is_none());
             }
-            order.push(arrived);
+            order.push(arrival.at);
         });
         assert_eq!(order, [1, 2, 3, 4]);
-        assert!(held.take(call(0, 1), 5).is_some());
+        assert!(held.take(call(1, 5)).is_some());
     }
 
     #[test]
@@ -189,7 +195,7 @@ mod tests {
         let held = Held::default();
         let first = held.hold();
         let second = held.hold();
-        assert!(held.take(call(0, 1), 1).is_none());
+        assert!(held.take(call(1, 1)).is_none());
         // The first one's time is up; then it is subscribed to, which changes nothing for the second.
         held.release(first);
         assert!(passed(&held).is_empty());
@@ -204,10 +210,10 @@ mod tests {
         let held = Held::default();
         held.hold();
         for number in 0..300 {
-            assert!(held.take(call(0, 1), number).is_none());
+            assert!(held.take(call(1, number)).is_none());
         }
         assert_eq!(passed(&held).len(), 300 - MOST.0 + 1);
-        assert!(held.take(call(0, MOST.1), 300).is_none());
+        assert!(held.take(call(MOST.1, 300)).is_none());
         assert_eq!(passed(&held).len(), MOST.0);
     }
 }

@@ -4,14 +4,14 @@ use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use bytes::Bytes;
+use budget::Permit;
 use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::duplicates::Machine;
-use super::held::{Held, Hold};
+use super::held::{Arrival, Held, Hold};
 use super::inputs::Inputs;
 use super::lent::RobotServices;
 use super::node_time::{self, NodeTime};
@@ -22,7 +22,7 @@ use crate::Flow;
 use link::clock::Sample;
 use link::control::{FromCloud, FromRobot, Hello, Refused, Request, Sla};
 use link::drops::{Drop, Drops, Reporter};
-use link::record::Record;
+use link::record::{Called, Record};
 use link::session::{CloudSession, Handler, SessionOptions};
 use link::skew::Direction;
 use ros::codec::Stamps;
@@ -68,10 +68,19 @@ pub(super) struct NodeLink {
     refused: Mutex<Vec<Refused>>,
     /// What must wait for an output to be subscribed to.
     pub(super) held: Held,
-    orders: mpsc::UnboundedSender<(FromRobot, Option<Hold>)>,
+    orders: mpsc::UnboundedSender<Order>,
     /// They wait for no order: a node that answers nobody is the one to be ended.
     signals: mpsc::UnboundedSender<i32>,
     tasks: Mutex<Vec<AbortHandle>>,
+}
+
+/// What the robot tells, until it is done.
+struct Order {
+    told: FromRobot,
+    /// What must wait until it is done.
+    hold: Option<Hold>,
+    /// It counts as the robot's until then.
+    _held: Permit,
 }
 
 /// What the node serves.
@@ -256,7 +265,15 @@ impl NodeLink {
             .collect()
     }
 
-    fn call(self: &Arc<Self>, id: u32, service: u32, request: Bytes, taken: i64) {
+    /// Calls a service of the node; the request counts as the robot's until it is answered.
+    fn call(self: &Arc<Self>, call: Called) {
+        let Called {
+            id,
+            service,
+            request,
+            held,
+            taken,
+        } = call;
         let known = self.services.lock().get(&service).cloned();
         let (Some(service), Some(hub)) = (known, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
@@ -265,6 +282,7 @@ impl NodeLink {
         let link = Arc::clone(self);
         // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
         tokio::spawn(async move {
+            let _held = held;
             let patience = match names::action_part(&service.name) {
                 Some((_, "get_result")) => GOAL,
                 _ => hub.options.call_timeout,
@@ -291,14 +309,14 @@ impl Handler<FromRobot> for NodeLink {
         self.inputs.undecodable(&self.drops, channel);
     }
 
-    fn record(&self, record: Record<FromRobot>, arrived: i64) {
+    fn record(&self, record: Record<FromRobot>, held: Permit, arrived: i64) {
         // The hub holds every link by an Arc; one that it let go of hears no more.
         let Some(hub) = self.hub.upgrade() else {
             return;
         };
         let link = hub.links.lock().get(&self.node).cloned();
         if let Some(link) = link.filter(|link| std::ptr::eq(&**link, self)) {
-            self.take(&link, record, arrived);
+            self.take(&link, record, held, arrived);
         }
     }
 
@@ -310,7 +328,7 @@ impl Handler<FromRobot> for NodeLink {
 }
 
 impl NodeLink {
-    fn take(&self, this: &Arc<Self>, record: Record<FromRobot>, arrived: i64) {
+    fn take(&self, this: &Arc<Self>, record: Record<FromRobot>, held: Permit, arrived: i64) {
         match record {
             Record::Answer { id, response, .. } => self.lent.answered(id, response),
             // A call that waits for it must not wait for other orders.
@@ -320,15 +338,16 @@ impl NodeLink {
             }
             // A channel is closed after the messages before it.
             Record::Data(_) | Record::Call { .. } | Record::Control(FromRobot::Close { .. }) => {
-                match self.held.take(record, arrived) {
-                    Some((record, arrived)) => this.give(record, arrived),
+                let at = arrived;
+                match self.held.take(Arrival { record, held, at }) {
+                    Some(arrival) => this.give(arrival),
                     // There may be too much by now.
                     None => this.pass_held(),
                 }
             }
-            Record::Control(order) => {
+            Record::Control(told) => {
                 // Data may follow in the same breath.
-                let hold = match &order {
+                let hold = match &told {
                     FromRobot::Open(input) => {
                         if let Some(hub) = self.hub.upgrade() {
                             self.inputs.expect(&hub, input);
@@ -341,7 +360,11 @@ impl NodeLink {
                     }
                     _ => None,
                 };
-                let _ = self.orders.send((order, hold));
+                let _ = self.orders.send(Order {
+                    told,
+                    hold,
+                    _held: held,
+                });
             }
         }
     }
@@ -349,7 +372,8 @@ impl NodeLink {
 
 impl NodeLink {
     /// Gives a message or a call to the node.
-    fn give(self: &Arc<Self>, record: Record<FromRobot>, arrived: i64) {
+    fn give(self: &Arc<Self>, arrival: Arrival) {
+        let Arrival { record, held, at } = arrival;
         match record {
             Record::Data(data) => {
                 let Some(hub) = self.hub.upgrade() else {
@@ -357,7 +381,7 @@ impl NodeLink {
                 };
                 let channel = data.channel;
                 let skew = self.skew(&hub);
-                let taken = self.inputs.take((skew, &self.drops), data, arrived);
+                let taken = self.inputs.take((skew, &self.drops), data, at);
                 if let Some((mark, answered)) = taken {
                     self.outputs.note(channel, mark, answered);
                 }
@@ -366,9 +390,19 @@ impl NodeLink {
                 id,
                 service,
                 request,
-            } => self.call(id, service, request, arrived),
-            Record::Control(order) => {
-                let _ = self.orders.send((order, None));
+            } => self.call(Called {
+                id,
+                service,
+                request,
+                held,
+                taken: at,
+            }),
+            Record::Control(told) => {
+                let _ = self.orders.send(Order {
+                    told,
+                    hold: None,
+                    _held: held,
+                });
             }
             Record::Answer { .. } => {}
         }
@@ -376,20 +410,16 @@ impl NodeLink {
 
     /// Gives it what has waited, if that need not wait any longer.
     pub(super) fn pass_held(self: &Arc<Self>) {
-        self.held.pass(|record, arrived| self.give(record, arrived));
+        self.held.pass(|arrival| self.give(arrival));
     }
 }
 
 /// Does what the robot tells, one thing after the other.
-async fn obey(
-    link: Arc<NodeLink>,
-    hub: Arc<Hub>,
-    mut orders: mpsc::UnboundedReceiver<(FromRobot, Option<Hold>)>,
-) {
+async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<Order>) {
     // A node that is slow to connect to one topic keeps nothing else waiting.
     let mut opening: HashMap<u32, AbortOnDropHandle<()>> = HashMap::new();
-    while let Some((order, hold)) = orders.recv().await {
-        match order {
+    while let Some(Order { told, hold, _held }) = orders.recv().await {
+        match told {
             FromRobot::Open(input) => {
                 opening.retain(|_, task| !task.is_finished());
                 if opening.len() >= OPENING {

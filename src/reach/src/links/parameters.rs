@@ -12,6 +12,7 @@ use tokio::task::AbortHandle;
 use super::Hub;
 use super::node_time::SIMULATED;
 use super::runs::RUNS;
+use link::Echoes;
 use link::control::{FromCloud, Hello, Node};
 
 /// Whether the Master's side has it of itself, or keeps runs of nodes there.
@@ -22,7 +23,7 @@ fn is_own(name: &str) -> bool {
 /// What was set here in the robot's name: it does not go back.
 #[derive(Default)]
 pub(super) struct Known {
-    set: Mutex<BTreeMap<String, ParamValue>>,
+    set: Echoes,
     /// Set by a node before there was a link to tell it.
     untold: Mutex<BTreeMap<String, Option<ParamValue>>>,
     watching: OnceCell<AbortHandle>,
@@ -67,7 +68,7 @@ impl Known {
             match value {
                 Some(value) => self.set(hub, key, value).await,
                 None => {
-                    self.set.lock().remove(&key);
+                    self.set.forget(&key);
                     if let Ok(parameters) = hub.bus.parameters() {
                         let _ = parameters.delete(&key).await;
                     }
@@ -81,8 +82,9 @@ impl Known {
         let Ok(parameters) = hub.bus.parameters() else {
             return;
         };
-        self.set.lock().insert(key.clone(), value.clone());
+        self.set.expect(&key, &value);
         if let Err(error) = parameters.set(&key, value).await {
+            self.set.forget(&key);
             tracing::warn!(key, %error, "a parameter of the robot cannot be set");
         }
     }
@@ -110,10 +112,9 @@ impl Known {
 
     /// Tells the link whose node the parameter belongs to, or any: they are on one robot.
     fn report(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
-        if key.starts_with(RUNS) || self.set.lock().get(&key) == value.as_ref() {
+        if key.starts_with(RUNS) || self.set.is_echo(&key, value.as_ref()) {
             return;
         }
-        self.set.lock().remove(&key);
         let links = hub.links.lock();
         let owner = links.values().find(|link| key.starts_with(&link.node));
         match owner.or_else(|| links.values().next()) {

@@ -107,7 +107,10 @@ async fn says(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcom
     tokio::spawn(async move { hub.serve(cloud, b"").await });
     let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
-    let welcome = receive_open(&mut socket, "welcome").await.unwrap();
+    let mut held = Budget::unlimited().permit();
+    let welcome = receive_open(&mut socket, "welcome", &mut held)
+        .await
+        .unwrap();
     (socket, welcome)
 }
 
@@ -135,6 +138,54 @@ async fn closed(mut socket: WebSocket<DuplexStream>) -> String {
             Err(error) => return error.to_string(),
         }
     }
+}
+
+/// A robot's parameters, in a text of a hundred kilobytes: maps of one member.
+fn many_parameters() -> BTreeMap<String, ParamValue> {
+    let one = || ParamValue::Map([("b".to_owned(), ParamValue::Int(1))].into());
+    let all = (0..10_000).map(|n| (format!("a{n}"), one())).collect();
+    [("all".to_owned(), ParamValue::Map(all))].into()
+}
+
+#[tokio::test]
+async fn parameters_of_a_hello_count_until_they_are_set() {
+    let budget = Budget::new("robot x", 64 << 20);
+    let options = HubOptions {
+        budget: budget.clone(),
+        ..HubOptions::default()
+    };
+    let (hub, _nodes) = hub_with(options).await;
+    let mut hello = hello("/detect", 1);
+    hello.parameters = many_parameters();
+    let (_socket, welcome) = says(&hub, &hello).await;
+    assert!(matches!(welcome, Welcome::Accepted { .. }), "{welcome:?}");
+    assert!(budget.used() < 1 << 20, "{} bytes are held", budget.used());
+}
+
+#[tokio::test]
+async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
+    let options = HubOptions {
+        budget: Budget::new("robot x", 4 << 20),
+        ..HubOptions::default()
+    };
+    let (hub, nodes) = hub_with(options).await;
+    let mut long = hello("/detect", 1);
+    long.parameters = many_parameters();
+    let mut wordy = hello("/detect", 1);
+    wordy.host = "x".repeat(MAX_CONTROL);
+    for (hello, words) in [
+        (long, "do not fit into the memory for robot x"),
+        (wordy, "a hello without parameters of 10485"),
+    ] {
+        let (robot, cloud) = duplex(1 << 16);
+        let hub = Arc::clone(&hub);
+        tokio::spawn(async move { hub.serve(cloud, b"").await });
+        let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
+        send_open(&mut socket, &hello).await.unwrap();
+        let reason = closed(socket).await;
+        assert!(reason.contains(words), "{reason}");
+    }
+    assert!(nodes.running.lock().is_empty());
 }
 
 #[tokio::test]
@@ -294,7 +345,8 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     .await;
     let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let tell = |order| link::Handler::record(&*link, Record::Control(order), 0);
+    let held = || Budget::unlimited().permit();
+    let tell = |order| link::Handler::record(&*link, Record::Control(order), held(), 0);
     tell(FromRobot::Open(Input {
         channel: 1,
         topic: "/image".into(),

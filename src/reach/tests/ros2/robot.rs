@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::clock::now;
 use link::control::{
@@ -89,7 +90,8 @@ async fn says(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcom
     tokio::spawn(async move { hub.serve(theirs, &[]).await });
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.expect("a connection");
-    let welcome = receive_open(&mut socket, "welcome").await;
+    let mut held = Budget::unlimited().permit();
+    let welcome = receive_open(&mut socket, "welcome", &mut held).await;
     (socket, welcome.expect("a welcome"))
 }
 
@@ -132,7 +134,7 @@ struct Ear {
 }
 
 impl Handler<FromCloud> for Ear {
-    fn record(&self, record: Record<FromCloud>, _arrived: i64) {
+    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         match record {
             Record::Data(data) => drop(self.heard.send((data.channel, data.message))),
             Record::Answer { id, response, .. } => drop(self.answers.send((id, response))),
