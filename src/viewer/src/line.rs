@@ -13,7 +13,7 @@ use ws::{Message, WebSocket, WsError, frame};
 /// What is sent to a viewer. Both are payloads of one frame.
 pub enum Frame {
     /// JSON.
-    Text(String),
+    Text(Bytes),
     /// A message, or an answer.
     Binary(Bytes),
 }
@@ -92,7 +92,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
     /// Sends a frame, as far as [`next`](Self::next) is waited for.
     pub fn send(&mut self, frame: Frame) {
         match frame {
-            Frame::Text(text) => self.socket.queue(frame::TEXT, text.into()),
+            Frame::Text(text) => self.socket.queue(frame::TEXT, text),
             Frame::Binary(bytes) => self.socket.queue(frame::BINARY, bytes),
         }
     }
@@ -237,7 +237,7 @@ mod tests {
         let (ours, _theirs) = tokio::io::duplex(64);
         let mut line = Line::new(WebSocket::new(ours, b"", BIG, BIG));
         assert!(line.is_read() && line.is_given());
-        line.answer(Frame::Text("x".repeat(BIG)));
+        line.answer(Frame::Text("x".repeat(BIG).into()));
         assert!(!line.is_read() && !line.is_given());
     }
 }

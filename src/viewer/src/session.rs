@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use access::Operation;
 use bridge::Granted;
-use budget::Budget;
+use budget::{Budget, Exceeded, JsonWeight};
 use bytes::Bytes;
 use foxglove::ws_protocol::JsonMessage;
 use foxglove::ws_protocol::client::{self, ClientMessage};
@@ -250,7 +250,13 @@ impl Session {
     }
 
     fn tell(&mut self, message: &impl JsonMessage) {
-        self.told.push(Frame::Text(message.to_string()));
+        self.told.push(Frame::Text(message.to_string().into()));
+    }
+
+    /// What is to be sent, which counts as the viewer's until it is.
+    fn counted(&self, bytes: impl Into<Bytes>) -> Result<Bytes, Exceeded> {
+        let bytes = bytes.into();
+        Ok(self.budget.take(bytes.len())?.around(bytes))
     }
 
     fn complain(&mut self, words: impl Into<String>) {
@@ -372,13 +378,20 @@ impl Session {
                 message.len()
             ));
         }
-        let message = match is_text {
-            true => std::str::from_utf8(message)
+        let mut held = self.budget.permit();
+        if is_text {
+            // Values of parameters are read by what serde derives for a type of the protocol's crate.
+            let weight = JsonWeight::of(message).bytes_if_copied();
+            if let Err(full) = held.count(weight) {
+                return self.complain(format!("this message is not read: {full}"));
+            }
+        }
+        let message = if is_text {
+            std::str::from_utf8(message)
                 .map_err(|error| error.to_string())
-                .and_then(|text| {
-                    ClientMessage::parse_json(text).map_err(|error| error.to_string())
-                }),
-            false => ClientMessage::parse_binary(message).map_err(|error| error.to_string()),
+                .and_then(|text| ClientMessage::parse_json(text).map_err(|error| error.to_string()))
+        } else {
+            ClientMessage::parse_binary(message).map_err(|error| error.to_string())
         };
         let message = match message {
             Ok(message) => message,
@@ -440,7 +453,10 @@ impl Session {
                     Some(id) => told.with_id(id),
                     None => told,
                 };
-                self.tell(&told);
+                match self.counted(told.to_string()) {
+                    Ok(told) => self.told.push(Frame::Text(told)),
+                    Err(full) => self.complain(format!("parameters: {full}")),
+                }
             }
             Err(error) => self.complain(format!("parameters cannot be read: {error}")),
         }

@@ -3,14 +3,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use async_trait::async_trait;
 use bridge::Granted;
 use budget::Budget;
 use bytes::Bytes;
-use ros::bus::{Bus, ParamValue, Qos, RosVersion, WireType, reaches};
+use ros::bus::{Bus, ParamValue, Qos, RosVersion, ServiceHandler, ServiceType, WireType, reaches};
 use ros::schema::Registry;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use crate::memory_bus::MemorySystem;
@@ -23,11 +25,11 @@ const LONG: Duration = Duration::from_secs(30);
 struct Viewer(DuplexStream);
 
 impl Viewer {
-    /// A frame of less than 126 bytes, with a mask of nothing.
+    /// A frame of less than 64 KiB, with a mask of nothing.
     async fn sends(&mut self, opcode: u8, payload: &[u8]) {
-        let length = u8::try_from(payload.len()).expect("a short frame");
-        assert!(length < 126, "a short frame");
-        let head = [0x80 | opcode, 0x80 | length, 0, 0, 0, 0];
+        let length = u16::try_from(payload.len()).expect("a short frame");
+        let length = length.to_be_bytes();
+        let head = [0x80 | opcode, 0x80 | 126, length[0], length[1], 0, 0, 0, 0];
         let frame = [&head, payload].concat();
         self.0.write_all(&frame).await.expect("taken");
     }
@@ -36,6 +38,7 @@ impl Viewer {
         let opcode = self.0.read_u8().await.expect("a frame") & 0x0f;
         let length = match self.0.read_u8().await.expect("a length") {
             126 => usize::from(self.0.read_u16().await.expect("a length")),
+            127 => self.0.read_u64().await.expect("a length") as usize,
             short => usize::from(short),
         };
         let mut payload = vec![0; length];
@@ -52,7 +55,7 @@ impl Viewer {
                     continue;
                 }
                 let told: Value = serde_json::from_slice(&payload).expect("JSON");
-                assert_ne!(told["op"], "status", "{told}");
+                assert!(told["op"] == op || told["op"] != "status", "{told}");
                 if told["op"] == op {
                     return told;
                 }
@@ -60,6 +63,103 @@ impl Viewer {
         };
         timeout(LONG, told).await.expect("it is told")
     }
+}
+
+/// A viewer of the system, with this budget, and what serves it.
+fn looks(
+    system: &Arc<MemorySystem>,
+    registry: Arc<Registry>,
+    budget: &Budget,
+) -> (Viewer, JoinHandle<()>) {
+    let (ours, theirs) = tokio::io::duplex(1 << 16);
+    let bus: Arc<dyn Bus> = system.join("/cloudroid_inside");
+    let (ends, ended) = watch::channel(None);
+    let servant = Servant {
+        bus,
+        registry,
+        ended,
+        held: Box::new(ends),
+    };
+    let options = ViewerOptions {
+        name: "lab".to_owned(),
+        granted: Granted::always(access::Grants::everything()),
+        budget: budget.clone(),
+        unfinished: LONG,
+        depth: 2,
+    };
+    let serving = serve(ours, Bytes::new(), async { Ok(servant) }, options);
+    (Viewer(theirs), tokio::spawn(serving))
+}
+
+/// Answers with a picture of a megabyte.
+struct Pictures;
+
+#[async_trait]
+impl ServiceHandler for Pictures {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+        let length = 1_u32 << 20;
+        let head = [&[0, 1, 0, 0], &length.to_le_bytes()[..]].concat();
+        Ok([head, vec![7; length as usize]].concat().into())
+    }
+}
+
+#[tokio::test]
+async fn answers_to_calls_count_as_the_viewers() {
+    let definitions = [("lab/srv/Shoot", "---\nuint8[] data\n")];
+    let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
+    let registry = Registry::of_definitions(RosVersion::Two, &definitions.into()).expect("valid");
+    let registry = Arc::new(registry);
+    let of = ServiceType::of(&registry.service("lab/Shoot").expect("defined"));
+    let system = Arc::new(MemorySystem::default());
+    let node = system.join("/see");
+    let serving = node.serve("/shoot", of, Arc::new(Pictures));
+    let _serving = serving.await.expect("served");
+    for (limit, is_answered) in [(4 << 20, true), (1 << 20, false)] {
+        let budget = Budget::new("viewer x", limit);
+        let (mut viewer, serving) = looks(&system, Arc::clone(&registry), &budget);
+        let told = viewer.told("advertiseServices").await;
+        let id = told["services"][0]["id"].as_u64().expect("a number") as u32;
+        let mut call = vec![2];
+        for number in [id, 9, 3] {
+            call.extend_from_slice(&number.to_le_bytes());
+        }
+        call.extend_from_slice(b"cdr\0\x01\0\0\0");
+        viewer.sends(2, &call).await;
+        if is_answered {
+            let (opcode, answer) = timeout(LONG, viewer.frame()).await.expect("an answer");
+            assert_eq!((opcode, answer[0]), (2, 3));
+            assert!(answer.len() > 1 << 20);
+        } else {
+            let failure = viewer.told("serviceCallFailure").await;
+            let words = failure["message"].as_str().expect("a text");
+            assert!(words.contains("the memory for viewer x"), "{words}");
+        }
+        assert!(budget.refused() == u64::from(!is_answered));
+        drop(viewer);
+        serving.await.expect("it ends");
+        assert_eq!(budget.used(), 0);
+    }
+}
+
+#[tokio::test]
+async fn what_would_take_too_much_is_not_read() {
+    let system = Arc::new(MemorySystem::default());
+    let budget = Budget::new("viewer x", 16 << 20);
+    let (mut viewer, _serving) = looks(&system, Arc::default(), &budget);
+    // The crate that reads it would copy all the ones for each of the lists around them.
+    let value = format!(
+        "{}{}1{}",
+        "[".repeat(100),
+        "1,".repeat(8000),
+        "]".repeat(100)
+    );
+    let set =
+        format!(r#"{{"op":"setParameters","parameters":[{{"name":"/see.a","value":{value}}}]}}"#);
+    viewer.sends(1, set.as_bytes()).await;
+    let status = viewer.told("status").await;
+    let words = status["message"].as_str().expect("a text");
+    assert!(words.contains("this message is not read"), "{words}");
+    assert!(words.contains("the memory for viewer x"), "{words}");
 }
 
 #[tokio::test]
@@ -82,26 +182,7 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     let rate = vec![("camera.rate".to_owned(), Some(ParamValue::Double(2.5)))];
     parameters.set("/see", rate).await.expect("set");
 
-    let (ours, theirs) = tokio::io::duplex(1 << 16);
-    let (_ends, ended) = watch::channel(None);
-    let bus: Arc<dyn Bus> = system.join("/cloudroid_inside");
-    let servant = Servant {
-        bus,
-        registry,
-        ended,
-        held: Box::new(()),
-    };
-    let options = ViewerOptions {
-        name: "lab".to_owned(),
-        granted: Granted::always(access::Grants::everything()),
-        budget: Budget::unlimited(),
-        unfinished: LONG,
-        depth: 2,
-    };
-    let serving = serve(ours, Bytes::new(), async { Ok(servant) }, options);
-    let serving = tokio::spawn(serving);
-    let mut viewer = Viewer(theirs);
-
+    let (mut viewer, serving) = looks(&system, registry, &Budget::unlimited());
     let info = viewer.told("serverInfo").await;
     assert_eq!(info["supportedEncodings"], json!(["cdr"]));
     let told = viewer.told("advertise").await;

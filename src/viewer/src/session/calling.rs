@@ -18,10 +18,34 @@ const CALLS: usize = 32;
 /// For the answer to a call.
 const ANSWER: Duration = Duration::from_secs(60);
 
+/// Bytes of an answer before its payload, at most: numbers and the encoding's name.
+const HEAD: usize = 64;
+
+/// A call that may be made.
+struct Called {
+    service: String,
+    of: Arc<ServiceDef>,
+    /// It counts as the viewer's.
+    request: Bytes,
+}
+
 impl Session {
     pub(super) async fn call(&mut self, call: client::ServiceCallRequest<'_>) {
         let (service_id, call_id) = (call.service_id, call.call_id);
-        let (service, of) = match self.may_call(&call) {
+        let found = self.may_call(&call).and_then(|(service, of)| {
+            let request = self.counted(call.payload.to_vec());
+            let request = request.map_err(|full| format!("{service}: {full}"))?;
+            Ok(Called {
+                service,
+                of,
+                request,
+            })
+        });
+        let Called {
+            service,
+            of,
+            request,
+        } = match found {
             Ok(found) => found,
             Err(words) => {
                 let failure = ServiceCallFailure::new(service_id, call_id, words);
@@ -30,25 +54,29 @@ impl Session {
         };
         self.calls += 1;
         let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
-        let encoding = self.format.encoding;
-        let request = Bytes::copy_from_slice(&call.payload);
+        let (encoding, budget) = (self.format.encoding, self.budget.clone());
         self.tasks.spawn(async move {
             let digest = of.md5.as_str().into();
             let answered = bus.call_typed(&service, &digest, request, ANSWER).await;
-            let message = match answered {
-                Ok(answer) => {
-                    let response = ServiceCallResponse {
-                        service_id,
-                        call_id,
-                        encoding: encoding.into(),
-                        payload: (&answer[..]).into(),
-                    };
-                    Frame::Binary(response.to_bytes().into())
-                }
-                Err(error) => {
-                    let words = format!("{service}: {error}");
+            let answered = answered.map_err(|error| error.to_string());
+            let response = answered.and_then(|answer| {
+                // Before it is copied.
+                let permit = budget.take(HEAD + answer.len());
+                let permit = permit.map_err(|full| format!("the answer: {full}"))?;
+                let response = ServiceCallResponse {
+                    service_id,
+                    call_id,
+                    encoding: encoding.into(),
+                    payload: (&answer[..]).into(),
+                };
+                Ok(permit.around(response.to_bytes()))
+            });
+            let message = match response {
+                Ok(response) => Frame::Binary(response),
+                Err(words) => {
+                    let words = format!("{service}: {words}");
                     let failure = ServiceCallFailure::new(service_id, call_id, words);
-                    Frame::Text(failure.to_string())
+                    Frame::Text(failure.to_string().into())
                 }
             };
             let _ = out.send(message).await;

@@ -66,7 +66,7 @@ impl Session {
                 Err(error) => {
                     let words = format!("{listened} cannot be subscribed to: {error}");
                     let _ = out
-                        .send(Frame::Text(Status::error(words).to_string()))
+                        .send(Frame::Text(Status::error(words).to_string().into()))
                         .await;
                 }
             }
@@ -115,7 +115,7 @@ impl Reader {
                     "{}: {missed} messages were left out, since they come faster than they are read",
                     self.topic
                 );
-                let status = Frame::Text(Status::warning(words).to_string());
+                let status = Frame::Text(Status::warning(words).to_string().into());
                 let _ = self.out.send(status).await;
             }
         }
