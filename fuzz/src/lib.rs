@@ -3,16 +3,22 @@
 //!
 //! The fuzzer calls them from `fuzz_targets/` (`make fuzz ONLY=ros_json`), the tests from `tests/replay.rs`, with the
 //! kept corpus and some damage done to it. A new target is a function here, an entry in [`TARGETS`], a program in
-//! `fuzz_targets/` with its `[[bin]]`, and a few seeds in `corpus/`.
+//! `fuzz_targets/` with its `[[bin]]`, and a few seeds in `corpus/`; where it reads what strangers send, one in
+//! [`DECODERS`](decoders::DECODERS), too, whose memory `tests/memory.rs` measures.
 
 #![forbid(unsafe_code)]
 
 pub mod authority;
 pub mod codec;
+pub mod damage;
+pub mod decoders;
+pub mod link;
 pub mod ros;
 pub mod ros2;
 pub mod rosbridge;
 pub mod rtps;
+pub mod viewer;
+pub mod ws;
 
 /// What takes the fuzzer's bytes.
 pub type Target = fn(&[u8]);
@@ -48,6 +54,12 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("rtps_discovery", rtps::discovery),
     ("ros_tcpros", ros::tcpros),
     ("ros_xmlrpc", ros::xmlrpc),
+    ("ros_parameter", ros::parameter),
+    ("link_frame", link::frame),
+    ("link_hello", link::hello),
+    ("link_orders", link::orders),
+    ("ws_frames", ws::frames),
+    ("viewer_json", viewer::json),
 ];
 
 /// The program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzer's build it does nothing.

@@ -3,13 +3,13 @@
 
 use std::sync::{Arc, LazyLock};
 
-use ::ros::bus::RosVersion;
+use ::ros::bus::{ParamValue, RosVersion};
 use ::ros::codec::{
     self, CborOptions, CodecErrorKind, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Stamps,
     Time, Value, cbor_item_len, json_value_len,
 };
 use ::ros::ros1::tcpros::{FrameReader, Header};
-use ::ros::ros1::xmlrpc::{parse_call, parse_response, print_call, print_response};
+use ::ros::ros1::xmlrpc::{self, parse_call, parse_response, print_call, print_response};
 use ::ros::schema::{MessageType, Registry};
 use bytes::BytesMut;
 
@@ -249,5 +249,19 @@ pub fn xmlrpc(data: &[u8]) {
         parse_response(print_response(&value).as_bytes())
             .expect("its own response")
             .expect("a value");
+    }
+}
+
+/// A parameter in JSON.
+pub fn parameter(data: &[u8]) {
+    let Ok(value) = serde_json::from_slice::<ParamValue>(data) else {
+        return;
+    };
+    let written = serde_json::to_vec(&value).expect("it can be written");
+    let again = serde_json::from_slice::<ParamValue>(&written);
+    assert_eq!(again.expect("its own JSON"), value);
+    if let Ok(sent) = xmlrpc::Value::try_from(value.clone()) {
+        assert!(sent.depth() <= ParamValue::MAX_DEPTH);
+        assert_eq!(ParamValue::from(sent), value);
     }
 }

@@ -197,3 +197,118 @@ fn every_module_of_stories_and_every_crate_has_a_subject() {
         );
     }
 }
+
+/// A struct or enum as it stands in a file.
+struct Type {
+    file: PathBuf,
+    name: String,
+    attributes: String,
+    /// Words of its body, comments aside.
+    words: BTreeSet<String>,
+}
+
+/// Names in a line; of paths the last one, and none of another crate's.
+fn words(line: &str) -> Vec<String> {
+    let is_of_path = |character: char| character.is_alphanumeric() || "_:".contains(character);
+    let paths = line.split(|character| !is_of_path(character));
+    let own = paths.filter_map(|path| match path.trim_matches(':').split_once("::") {
+        None => Some(path.trim_matches(':')),
+        Some(("crate" | "self" | "super", rest)) => rest.rsplit("::").next(),
+        Some(_) => None,
+    });
+    own.filter(|word| !word.is_empty())
+        .map(str::to_owned)
+        .collect()
+}
+
+/// The types of a file, found by how rustfmt lays them out.
+fn types(file: &Path) -> Vec<Type> {
+    let text = std::fs::read_to_string(file).expect("text");
+    let lines: Vec<&str> = text.lines().collect();
+    let mut types = Vec::new();
+    for (at, line) in lines.iter().enumerate() {
+        let declared = line.trim_start();
+        let indent = line.len() - declared.len();
+        let mut head = words(declared).into_iter();
+        let is_type = |word: &String| word == "struct" || word == "enum";
+        let keyword = head
+            .by_ref()
+            .find(|word| !matches!(word.as_str(), "pub" | "crate" | "super"));
+        let (true, Some(name)) = (keyword.as_ref().is_some_and(is_type), head.next()) else {
+            continue;
+        };
+        let above = lines[..at].iter().rev().take_while(|line| {
+            let line = line.trim();
+            !(line.is_empty() || line.ends_with(';') || line == "}")
+        });
+        let is_code = |line: &&&str| !line.trim_start().starts_with("//");
+        let ends =
+            |line: &&str| line.len() - line.trim_start().len() == indent && line.trim() == "}";
+        let body = lines[at + 1..].iter().take_while(|line| !ends(line));
+        // A type of one line ends in it.
+        let body = body.take(if line.ends_with('{') { usize::MAX } else { 0 });
+        types.push(Type {
+            file: file.to_owned(),
+            name,
+            attributes: above.filter(is_code).copied().collect(),
+            words: head
+                .chain(body.filter(is_code).flat_map(|line| words(line)))
+                .collect(),
+        });
+    }
+    types
+}
+
+/// Rust files below a directory.
+fn sources(directory: &Path, into: &mut Vec<PathBuf>) {
+    let Ok(entries) = std::fs::read_dir(directory) else {
+        return;
+    };
+    for entry in entries {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            sources(&path, into);
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            into.push(path);
+        }
+    }
+}
+
+/// What serde derives for an untagged enum keeps a copy of what it reads: one that holds itself keeps one for each level, so that a short
+/// text that is nested takes all memory. Who needs such a type reads it by a visitor, as `ros::bus::ParamValue` is read.
+#[test]
+fn no_untagged_enum_is_read_that_holds_itself() {
+    let mut untagged = 0;
+    for directory in members().keys() {
+        let mut files = Vec::new();
+        for part in ["src", "tests", "fuzz_targets", "examples"] {
+            sources(&root().join(directory).join(part), &mut files);
+        }
+        let types: Vec<Type> = files.iter().flat_map(|file| types(file)).collect();
+        let mut holds: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+        for one in &types {
+            let words = one.words.iter().map(String::as_str);
+            holds.entry(&one.name).or_default().extend(words);
+        }
+        let is_read_untagged = |one: &&Type| {
+            one.attributes.contains("untagged") && one.attributes.contains("Deserialize")
+        };
+        for one in types.iter().filter(is_read_untagged) {
+            untagged += 1;
+            let mut reached = BTreeSet::new();
+            let mut next: Vec<&str> = one.words.iter().map(String::as_str).collect();
+            while let Some(name) = next.pop() {
+                if reached.insert(name) {
+                    next.extend(holds.get(name).into_iter().flatten());
+                }
+            }
+            assert!(
+                !reached.contains(one.name.as_str()) && !one.words.contains("Self"),
+                "{} in {} is untagged, read, and holds itself",
+                one.name,
+                one.file.display()
+            );
+        }
+    }
+    assert!(untagged > 5, "{untagged} untagged enums were found");
+}

@@ -1,0 +1,3 @@
+//! The opening frames of a link.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(link, hello);

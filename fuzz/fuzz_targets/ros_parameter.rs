@@ -1,0 +1,3 @@
+//! A parameter in JSON.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(ros, parameter);

@@ -1,0 +1,3 @@
+//! JSON of Foxglove's protocol.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(viewer, json);

@@ -1,0 +1,3 @@
+//! What comes over a WebSocket.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(ws, frames);

@@ -1,0 +1,168 @@
+//! Texts that take much memory for what they are.
+
+/// A text of which one part is repeated.
+#[derive(Clone, Copy)]
+pub struct Repeat {
+    /// Stands before.
+    pub before: &'static str,
+    /// Is repeated.
+    pub part: &'static str,
+    /// Stands behind.
+    pub after: &'static str,
+}
+
+const fn repeat(before: &'static str, part: &'static str, after: &'static str) -> Repeat {
+    Repeat {
+        before,
+        part,
+        after,
+    }
+}
+
+impl Repeat {
+    /// The text, with as many parts as fit into `bytes` bytes.
+    pub fn text(&self, bytes: usize) -> String {
+        let mut text = self.before.to_owned();
+        let mut count = 0;
+        while text.len() + self.part.len() + self.after.len() < bytes {
+            text.push_str(&self.part.replace("{n}", &format!("{count:x}")));
+            count += 1;
+        }
+        text + self.after
+    }
+}
+
+/// Fifty lists, opened and closed.
+macro_rules! fifty {
+    ("[") => {
+        "[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[["
+    };
+    ("]") => {
+        "]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]"
+    };
+}
+
+/// Values in JSON between two texts.
+macro_rules! values {
+    ($before:expr, $after:expr) => {
+        &[
+            repeat(concat!($before, "["), "1,", concat!("1]", $after)),
+            repeat(concat!($before, "["), "[],", concat!("[]]", $after)),
+            repeat(concat!($before, "["), "[1],", concat!("[]]", $after)),
+            repeat(concat!($before, "["), "{},", concat!("{}]", $after)),
+            repeat(concat!($before, "["), "\"\",", concat!("1]", $after)),
+            repeat(concat!($before, "["), "{\"\":1},", concat!("1]", $after)),
+            repeat(
+                concat!($before, "{"),
+                "\"{n}\":1,",
+                concat!("\"\":1}", $after),
+            ),
+            repeat(
+                concat!($before, "{"),
+                "\"{n}\":[],",
+                concat!("\"\":1}", $after),
+            ),
+            repeat(concat!($before, "\""), "\\n", concat!("\"", $after)),
+            repeat(
+                concat!($before, fifty!("["), "["),
+                "1,",
+                concat!("1]", fifty!("]"), $after),
+            ),
+            repeat(
+                concat!($before, fifty!("["), "["),
+                "{\"\":1},",
+                concat!("1]", fifty!("]"), $after),
+            ),
+        ]
+    };
+}
+
+pub(super) const VALUES: &[Repeat] = values!("", "");
+pub(super) const HELLO: &[Repeat] = values!("{\"parameters\":{\"a\":", "}}");
+pub(super) const VIEWER: &[Repeat] = values!(
+    "{\"op\":\"setParameters\",\"parameters\":[{\"name\":\"a\",\"value\":",
+    "}]}"
+);
+pub(super) const ORDERS: &[Repeat] = &[
+    repeat("{\"requests\":[", "{},", "{}]}"),
+    repeat("{\"decided\":[", "{},", "{}]}"),
+    repeat("{\"refused\":[", "{},", "{}]}"),
+    repeat(
+        "{\"dropped\":[",
+        "{\"topic\":\"\",\"cause\":\"stale\",\"count\":1},",
+        "]}",
+    ),
+    repeat("{\"graph\":{\"outputs\":[", "{},", "{}]}}"),
+    repeat("{\"graph\":{\"inputs\":[", "{},", "{}]}}"),
+    repeat("{\"graph\":{\"services\":[", "{},", "{}]}}"),
+    repeat("{\"graph\":{\"siblings\":[", "\"\",", "\"\"]}}"),
+    repeat("{\"graph\":{\"nodes\":{", "\"{n}\":{},", "\"\":{}}}}"),
+    repeat(
+        "{\"graph\":{\"nodes\":{\"\":{\"inputs\":[",
+        "\"{n}\",",
+        "\"\"]}}}}",
+    ),
+    repeat("{\"parameters\":[", "[\"\",null],", "[\"\",null]]}"),
+    repeat("{\"parameters\":[", "[\"\",{\"\":1}],", "[\"\",null]]}"),
+    repeat("{\"parameters\":[[\"\",[", "{\"\":1},", "1]]]}"),
+    repeat(
+        "{\"lent\":{\"service\":\"\",\"of\":{\"halves\":[",
+        "\"\",",
+        "\"\"]}}}",
+    ),
+    repeat("{\"line\":{\"error\":false,\"text\":\"", "\\n", "\"}}"),
+    repeat("{\"later\":[", "{},", "{}]}"),
+];
+pub(super) const ROSBRIDGE: &[Repeat] = &[
+    repeat(
+        "{\"op\":\"publish\",\"topic\":\"/t\",\"msg\":[",
+        "{},",
+        "{}]}",
+    ),
+    repeat(
+        "{\"op\":\"publish\",\"topic\":\"/t\",",
+        "\"{n}\":1,",
+        "\"msg\":{}}",
+    ),
+    repeat("{\"op\":\"", "\\n", "\"}"),
+    repeat(
+        "{\"op\":\"fragment\",\"id\":\"1\",\"num\":0,\"total\":2,\"data\":\"",
+        "\\n",
+        "\"}",
+    ),
+];
+pub(super) const XML_RPC: &[Repeat] = &[
+    repeat(
+        "<methodResponse><params><param><value><array><data>",
+        "<value/>",
+        "</data></array></value></param></params></methodResponse>",
+    ),
+    repeat(
+        "<methodResponse><params><param><value><array><data>",
+        "<value><struct><member><name/><value/></member></struct></value>",
+        "</data></array></value></param></params></methodResponse>",
+    ),
+    repeat(
+        "<methodResponse><params><param><value><struct>",
+        "<member><name>{n}</name><value/></member>",
+        "</struct></value></param></params></methodResponse>",
+    ),
+    repeat(
+        "<methodCall><methodName>x</methodName><params>",
+        "<param><value/></param>",
+        "</params></methodCall>",
+    ),
+    repeat(
+        "<methodCall><methodName>",
+        "&lt;",
+        "</methodName></methodCall>",
+    ),
+];
+pub(super) const DEFINITIONS: &[Repeat] = &[
+    repeat("", "a{n}\n", ""),
+    repeat("", "bool a{n}\n", ""),
+    repeat("", "int8 A{n}=1\n", ""),
+    repeat("", "X{n} x{n}\n", ""),
+    repeat("Y y\n", "===\nMSG: b/Y{n}\nint8 a\n", ""),
+    repeat("", "#\n", ""),
+];

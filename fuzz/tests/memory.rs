@@ -1,0 +1,90 @@
+//! What decoders take in memory: an allocator counts it, for the kept corpus, for damage done to it, and for texts of which a part is
+//! repeated. `FUZZ_ROUNDS` sets how many damaged inputs each decoder is given.
+
+use fuzz::damage::{Dice, corpus};
+use fuzz::decoders::{DECODERS, Decoder};
+use peak_alloc::PeakAlloc;
+
+#[global_allocator]
+static ALLOCATOR: PeakAlloc = PeakAlloc;
+
+/// Sizes of inputs that are made, in bytes.
+const SIZES: [usize; 3] = [512, 16 << 10, 256 << 10];
+
+/// Bytes that a decoder took at once. Nothing else allocates meanwhile.
+fn taken(decoder: &Decoder, input: &[u8]) -> usize {
+    let before = ALLOCATOR.current_usage();
+    ALLOCATOR.reset_peak_usage();
+    (decoder.decode)(input);
+    ALLOCATOR.peak_usage().saturating_sub(before)
+}
+
+/// The worst of a decoder's inputs.
+#[derive(Default)]
+struct Worst {
+    /// Bytes taken for each byte of input.
+    times: f64,
+    input: String,
+}
+
+fn measure(decoder: &Decoder, input: &[u8], worst: &mut Worst) {
+    let taken = taken(decoder, input);
+    let shown = || {
+        let begin = String::from_utf8_lossy(&input[..input.len().min(120)]).into_owned();
+        format!("{}, {} bytes: {begin:?}", decoder.name, input.len())
+    };
+    let most = decoder.times * input.len() + decoder.fixed;
+    assert!(
+        taken <= most,
+        "{taken} bytes were taken, {most} may be, for {}",
+        shown()
+    );
+    if let Some(weigh) = decoder.weigh {
+        let weight = weigh(input);
+        // A message of an error is no part of the weight.
+        let most = weight + (4 << 10);
+        assert!(
+            taken <= most,
+            "{taken} bytes were taken, {weight} counted, for {}",
+            shown()
+        );
+    }
+    let times = taken.saturating_sub(decoder.fixed) as f64 / input.len().max(1) as f64;
+    if times > worst.times {
+        *worst = Worst {
+            times,
+            input: shown(),
+        };
+    }
+}
+
+#[test]
+fn decoders_take_a_bounded_multiple_of_their_input() {
+    let rounds = std::env::var("FUZZ_ROUNDS").map_or(300, |text| text.parse().expect("a number"));
+    for decoder in DECODERS {
+        let mut worst = Worst::default();
+        let seeds = corpus(decoder.name);
+        // What is made once is made before.
+        seeds.iter().for_each(|seed| (decoder.decode)(seed));
+        for seed in &seeds {
+            measure(decoder, seed, &mut worst);
+        }
+        for repeat in decoder.repeats {
+            for size in SIZES {
+                let text = repeat.text(size);
+                measure(decoder, text.as_bytes(), &mut worst);
+            }
+        }
+        let mut dice = Dice::default();
+        for round in 0..rounds {
+            let mut input = seeds[round % seeds.len()].clone();
+            let other = &seeds[round / seeds.len() % seeds.len()];
+            dice.damage(&mut input, other);
+            if round % 3 == 0 {
+                dice.repeat(&mut input, SIZES[round / 3 % SIZES.len()]);
+            }
+            measure(decoder, &input, &mut worst);
+        }
+        println!("{:>8.1} of {}: {}", worst.times, decoder.times, worst.input);
+    }
+}
