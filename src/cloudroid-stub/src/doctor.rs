@@ -5,6 +5,8 @@ mod server;
 
 use std::process::ExitCode;
 
+use foreign::terminal;
+
 use crate::arguments::{Doctor, Part};
 
 /// How a check came out.
@@ -86,7 +88,7 @@ pub fn examine(asked: &Doctor) -> anyhow::Result<ExitCode> {
         checks.extend(runtime.block_on(overlay::checks(&stub, &config, &variable)));
     }
     for check in &checks {
-        println!("{}", check.lines());
+        println!("{}", terminal::escape(&check.lines(), false));
     }
     let bad = checks.iter().any(|check| check.verdict == Verdict::Bad);
     Ok(if bad {

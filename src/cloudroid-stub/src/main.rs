@@ -43,6 +43,7 @@ use std::process::ExitCode;
 
 use arguments::{Arguments, Verb};
 use clap::Parser;
+use foreign::terminal;
 
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_env("CLOUDROID_LOG")
@@ -66,7 +67,9 @@ fn main() -> ExitCode {
         Verb::Pair(asked) => pairing::pair(&asked),
     };
     outcome.unwrap_or_else(|error| {
-        eprintln!("cloudroid-stub: {error:#}");
+        // It may have words of a server.
+        let text = format!("cloudroid-stub: {error:#}");
+        eprintln!("{}", terminal::escape(&text, false));
         ExitCode::FAILURE
     })
 }

@@ -30,6 +30,7 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
 use budget::Permit;
+use foreign::terminal;
 use link::control::{Exit, FromCloud, Graph};
 use link::drops::{Cause, Drops};
 use link::record::{Called, Record};
@@ -216,8 +217,13 @@ impl Handler<FromCloud> for Mirror {
                     taken: arrived,
                 },
             ),
-            Record::Control(FromCloud::Line { error: true, text }) => eprintln!("{text}"),
-            Record::Control(FromCloud::Line { text, .. }) => println!("{text}"),
+            // A server that is not to be trusted could have the robot's terminal do what it likes.
+            Record::Control(FromCloud::Line { error: true, text }) => {
+                eprintln!("{}", terminal::escape(&text, true));
+            }
+            Record::Control(FromCloud::Line { text, .. }) => {
+                println!("{}", terminal::escape(&text, true));
+            }
             Record::Control(FromCloud::Lookup { service }) => {
                 self.lent.look_up(self, service, held);
             }

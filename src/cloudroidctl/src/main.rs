@@ -42,7 +42,6 @@ mod status;
 mod stop;
 mod stream;
 mod stub;
-mod terminal;
 mod token;
 mod top;
 mod topics;

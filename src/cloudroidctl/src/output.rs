@@ -5,9 +5,8 @@ use std::io::{IsTerminal, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use api::{Limits, Millis, Servant};
+use foreign::terminal;
 use serde::Serialize;
-
-use crate::terminal;
 
 /// How to print.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -20,22 +19,24 @@ pub enum Format {
 
 /// Prints a value as indented JSON.
 pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
-    write_line(&terminal::safe_json(&serde_json::to_string_pretty(value)?))
+    write_line(&terminal::escape_json(&serde_json::to_string_pretty(
+        value,
+    )?))
 }
 
 /// Prints a value as one line of JSON.
 pub fn json_line(value: &impl Serialize) -> anyhow::Result<()> {
-    write_line(&terminal::safe_json(&serde_json::to_string(value)?))
+    write_line(&terminal::escape_json(&serde_json::to_string(value)?))
 }
 
 /// Prints a line at once, without control sequences.
 pub fn line(text: &str) -> anyhow::Result<()> {
-    write_line(&terminal::safe(text, std::io::stdout().is_terminal()))
+    write_line(&terminal::escape(text, std::io::stdout().is_terminal()))
 }
 
 /// A line for a screen that is drawn anew, without control sequences.
 pub fn shown(text: &str) -> Cow<'_, str> {
-    terminal::safe(text, false)
+    terminal::escape(text, false)
 }
 
 /// Writes what is no text for people as it is.
@@ -47,7 +48,7 @@ pub fn raw(bytes: &[u8]) -> anyhow::Result<()> {
 
 /// Prints a line on standard error, without control sequences.
 pub fn complain(text: &str) {
-    let shown = terminal::safe(text, std::io::stderr().is_terminal());
+    let shown = terminal::escape(text, std::io::stderr().is_terminal());
     // There is nobody left to tell.
     let _ = writeln!(std::io::stderr().lock(), "{shown}");
 }

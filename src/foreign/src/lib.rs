@@ -12,12 +12,15 @@
 //! directories may lie in each other by the thousand. Nothing here follows a link, leaves the tree, blocks on what it
 //! opens, reads more than it was told to, or uses the stack in proportion to the tree's depth. Calls block; [`cancel`]
 //! ends them early.
+//!
+//! What strangers wrote is also printed: [`terminal`] makes text of theirs safe for that.
 
 #![forbid(unsafe_code)]
 
 pub mod cancel;
 mod error;
 mod remove;
+pub mod terminal;
 mod tree;
 mod walk;
 

@@ -5,10 +5,10 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use api::{PushEvent, Size};
+use foreign::terminal;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::output::{self, Format};
-use crate::terminal;
 
 /// On a plain output, progress is said at most so often.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(5);
@@ -74,7 +74,7 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_style(ProgressStyle::with_template("{spinner} {msg} {elapsed}")?);
             bar.reset_elapsed();
-            bar.set_message(terminal::safe(title, false).into_owned());
+            bar.set_message(terminal::escape(title, false).into_owned());
         }
         Ok(())
     }
@@ -100,7 +100,7 @@ impl Progress {
                     bar.set_length(total);
                     bar.set_position(done);
                 }
-                bar.set_message(terminal::safe(&text, false).into_owned());
+                bar.set_message(terminal::escape(&text, false).into_owned());
                 Ok(())
             }
             None if self.said.elapsed() >= PLAIN_INTERVAL => {

@@ -1,4 +1,4 @@
-//! Makes text from nodes and compilers safe to print. Terminals interpret control sequences in text: these can rename the
+//! Makes text from nodes, compilers and servers safe to print. Terminals interpret control sequences in text: these can rename the
 //! window, type on the command line, or make a line look like another one.
 //!
 //! Control characters are shown as visible text. Colours (SGR, `ESC [ … m`) are kept on a terminal, because compilers'
@@ -10,7 +10,7 @@ use std::borrow::Cow;
 const LONGEST_COLOUR: usize = 32;
 
 /// `text` without control sequences. Line ends and tabs stay; colours stay if `colours`.
-pub fn safe(text: &str, colours: bool) -> Cow<'_, str> {
+pub fn escape(text: &str, colours: bool) -> Cow<'_, str> {
     if !text.contains(is_dangerous) {
         return Cow::Borrowed(text);
     }
@@ -42,7 +42,7 @@ pub fn safe(text: &str, colours: bool) -> Cow<'_, str> {
 }
 
 /// JSON without control characters: those that JSON allows in its strings are written as `\u…`, which means the same.
-pub fn safe_json(json: &str) -> Cow<'_, str> {
+pub fn escape_json(json: &str) -> Cow<'_, str> {
     if !json.contains(is_dangerous) {
         return Cow::Borrowed(json);
     }
@@ -89,8 +89,8 @@ mod tests {
             ("\x1b[31", "\\u{1b}[31"),
             ("\x1b[?25lm", "\\u{1b}[?25lm"),
         ] {
-            assert_eq!(safe(text, true), shown);
-            assert_eq!(safe(text, false), shown);
+            assert_eq!(escape(text, true), shown);
+            assert_eq!(escape(text, false), shown);
         }
     }
 
@@ -98,11 +98,11 @@ mod tests {
     fn colours_stay_on_a_terminal_and_end_with_their_line() {
         let text = "\x1b[01;31merror\x1b[0m: x\nnext \x1b[1mbold\nplain";
         assert_eq!(
-            safe(text, true),
+            escape(text, true),
             "\x1b[01;31merror\x1b[0m: x\x1b[0m\nnext \x1b[1mbold\x1b[0m\nplain"
         );
         assert_eq!(
-            safe("\x1b[31mred", false),
+            escape("\x1b[31mred", false),
             "\\u{1b}[31mred",
             "a file has no colours"
         );
@@ -112,7 +112,7 @@ mod tests {
     fn json_means_the_same() {
         let value = serde_json::json!({"line": "a\u{9b}b\u{7f}\u{202e}\x1b[2J", "tab": "\t"});
         let text = serde_json::to_string_pretty(&value).expect("json");
-        let printed = safe_json(&text);
+        let printed = escape_json(&text);
         assert!(!printed.contains(is_dangerous), "{printed:?}");
         let read: serde_json::Value = serde_json::from_str(&printed).expect("json");
         assert_eq!(read, value);
