@@ -1,64 +1,54 @@
-//! `make bench ONLY=survival`: a daemon is killed under traffic and started again, a hundred times; how many of its
-//! servants are lost, and how long it takes to find them beside its first start with none. Needs root.
+//! `make bench ONLY=survival`: what a daemon and its robots live through. Needs root.
+//!
+//! ```text
+//!  daemons    kill -9 of the daemon under traffic: servants that are lost, time until the next one answers
+//!  upgrade    26 servants at work, and the daemon replaced: servants that are lost, the longest gap a robot sees
+//!  wear       one daemon: kill -9 of shims, inits and nodes, crowds, half-open connections, all of it twice; what its process holds
+//!             after the second time beside the first
+//!  soak       the same daemon: mixed load by 20 robots, for three minutes or what CLOUDROID_BENCH_SOAK says (1h); what its process holds
+//!  disk       a full disk: robots at work, robots that are new, changes that were confirmed
+//! ```
+//! One of these words as an argument runs that part alone. `CLOUDROID_BENCH_ROUNDS` says how often each is killed.
 
 #![forbid(unsafe_code)]
 
-use std::time::{Duration, Instant};
+mod crowds;
+mod disk;
+mod greeters;
+mod half_open;
+mod kills;
+mod milliseconds;
+mod resources;
+mod soak;
+mod upgrade;
+mod wear;
 
-use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use serde_json::{Value, json};
-use support::daemon::{Daemon, Setup};
-use support::robot::Robot;
+use std::path::Path;
 
-/// How often it is killed; `CLOUDROID_BENCH_ROUNDS` says otherwise.
-const ROUNDS: u32 = 100;
-/// Servants that are to be found again each time.
-const ROBOTS: [&str; 3] = ["r1", "r2", "r3"];
-const CONFIG: &str = "keep_servants = true\n[servant]\nwarm_pool = 0\ngrace = \"1h\"\n";
+use anyhow::{Context, Result, bail};
+use bench_report::Report;
+/// How often each is killed.
+const ROUNDS: u32 = 50;
+/// Of that, how often where it takes longer, at most.
+const FEW: u32 = 5;
 
-fn path(robot: &str) -> String {
-    format!("greeter_cpp?robot={robot}")
-}
+/// In the directory of this run.
+const HOME: &str = "home";
 
-/// What must be the same afterwards: who serves, and as which processes.
-fn servants(daemon: &Daemon) -> Result<Vec<(Value, Value)>> {
-    ROBOTS
-        .iter()
-        .map(|robot| {
-            let servant = daemon.servant_of("greeter_cpp", robot)?;
-            Ok((servant["id"].clone(), servant["pids"].clone()))
-        })
-        .collect()
-}
-
-fn count(robot: &mut Robot) -> Result<u64> {
-    let answer = robot.calls("/greeter/count", json!({"reset": false}))?;
-    answer["values"]["count"]
-        .as_u64()
-        .with_context(|| answer.to_string())
-}
-
-/// Publishes until the node has counted on; how far.
-fn greet(robot: &mut Robot) -> Result<u64> {
-    let before = count(robot)?;
-    robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
-    robot.awaits_subscriber("/greeter/name")?;
-    loop {
-        robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
-        let now = count(robot)?;
-        if now > before {
-            return Ok(now);
-        }
-    }
-}
-
-/// In milliseconds.
-fn median(times: &[Duration]) -> f64 {
-    bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
-}
+const PARTS: [&str; 5] = ["daemons", "upgrade", "wear", "soak", "disk"];
 
 fn main() -> Result<()> {
+    // While there is one thread: whatever is mounted from here on is gone when this program is, however it ends.
+    support::disk::enter_namespace()?;
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let parts: Vec<&str> = match words.as_slice() {
+        [] => PARTS.to_vec(),
+        [word] if PARTS.contains(&word.as_str()) => vec![word],
+        _ => bail!(
+            "it takes nothing, or one of these words: {}",
+            PARTS.join(", ")
+        ),
+    };
     let rounds = match std::env::var("CLOUDROID_BENCH_ROUNDS") {
         Ok(rounds) => rounds.parse().context("CLOUDROID_BENCH_ROUNDS")?,
         Err(_) => ROUNDS,
@@ -66,80 +56,36 @@ fn main() -> Result<()> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    let setup = Setup::new(&place.path().join("home")).config(CONFIG);
-    let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .pushes("greeter_cpp", &["--node", "greeter"])?
-        .succeeded()?;
-    daemon.ends()?;
-    let timed = |setup: &Setup| -> Result<(Daemon, Duration)> {
-        let began = Instant::now();
-        Ok((setup.start()?, began.elapsed()))
-    };
-    let mut alone = Vec::new();
-    for _ in 0..5 {
-        let (daemon, took) = timed(&setup)?;
-        alone.push(took);
-        daemon.is_killed()?;
-    }
-    let mut daemon = setup.start()?;
-    for robot in ROBOTS {
-        greet(&mut daemon.robot(&path(robot))?)?;
-    }
-    let before = servants(&daemon)?;
-    let (mut lost, mut forgotten, mut found) = (0, 0, Vec::new());
-    for round in 0..rounds {
-        // One of them is at work when it happens.
-        let mut robot = daemon.robot(&path(ROBOTS[round as usize % ROBOTS.len()]))?;
-        let counted = greet(&mut robot)?;
-        robot.says(json!({"op": "call_service", "service": "/greeter/count", "args": {}}))?;
-        daemon.is_killed()?;
-        let (next, took) = timed(&setup)?;
-        daemon = next;
-        found.push(took);
-        let after = servants(&daemon);
-        lost += match &after {
-            Ok(after) => before
-                .iter()
-                .zip(after)
-                .filter(|(before, after)| before != after)
-                .count(),
-            Err(_) => ROBOTS.len(),
-        };
-        let mut robot = daemon.robot(&path(ROBOTS[round as usize % ROBOTS.len()]))?;
-        // More than was heard back may have been on its way.
-        if count(&mut robot)? < counted {
-            forgotten += 1;
-        }
-        ensure!(lost == 0, "round {round}: {before:?} became {after:?}");
-    }
-    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-    daemon.ends()?;
     let mut report = Report::new("survival");
-    report
-        .figure(
-            format!("servants lost in {rounds} rounds of kill -9"),
-            "",
-            lost as f64,
-        )
-        .reach(Target::AtMost(0.0))
-        .note(format!("{} servants, one of them at work", ROBOTS.len()));
-    report
-        .figure(
-            "nodes that had forgotten what they knew",
-            "",
-            f64::from(forgotten),
-        )
-        .reach(Target::AtMost(0.0));
-    report
-        .figure(
-            "start until it answers, with servants to find",
-            "ms",
-            median(&found),
-        )
-        .beside("with none", median(&alone))
-        .note("medians");
+    let measured = measure(&mut report, place.path(), &parts, rounds);
+    greeters::end_left(&place.path().join(HOME))?;
+    measured?;
     report.finish()?;
+    Ok(())
+}
+
+fn measure(report: &mut Report, place: &Path, parts: &[&str], rounds: u32) -> Result<()> {
+    let time = soak::duration()?;
+    let few = rounds.min(FEW);
+    let setup = greeters::publish(&place.join(HOME))?;
+    if parts.contains(&"daemons") {
+        kills::of_daemons(report, &setup, rounds)?;
+    }
+    if parts.contains(&"upgrade") {
+        upgrade::measure(report, &setup, few)?;
+    }
+    if parts.contains(&"wear") || parts.contains(&"soak") {
+        let daemon = setup.start()?;
+        if parts.contains(&"wear") {
+            wear::measure(report, &daemon, rounds, few)?;
+        }
+        if parts.contains(&"soak") {
+            soak::measure(report, &daemon, time)?;
+        }
+        daemon.ends()?;
+    }
+    if parts.contains(&"disk") {
+        disk::measure(report, place, few)?;
+    }
     Ok(())
 }

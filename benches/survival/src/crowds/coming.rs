@@ -1,0 +1,75 @@
+//! Robots that connect and leave at once.
+
+use std::net::{SocketAddr, TcpListener};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use bench_report::Report;
+use support::daemon::Daemon;
+use support::robot::Robot;
+use tokio_tungstenite::tungstenite;
+
+use super::joined;
+use crate::greeters;
+
+/// How long they do, from so many threads.
+const TIME: Duration = Duration::from_secs(5);
+const THREADS: usize = 4;
+
+/// Robots that connect and leave, a second.
+#[derive(Debug)]
+pub(super) struct Coming {
+    daemon: f64,
+    bare: f64,
+}
+
+pub(super) fn measure(daemon: &Daemon) -> Result<Coming> {
+    let bare = accept_upgrades()?;
+    Ok(Coming {
+        daemon: connections_a_second(&daemon.address, &greeters::path("crowd"))?,
+        bare: connections_a_second(&bare.to_string(), "")?,
+    })
+}
+
+impl Coming {
+    pub(super) fn tell(&self, report: &mut Report) {
+        report
+            .figure("robots that connect and leave", "/s", self.daemon)
+            .beside("a WebSocket server with nothing behind it", self.bare)
+            .note(format!("{THREADS} at a time"));
+    }
+}
+
+/// Accepts upgrades, and nothing else, until this program ends.
+fn accept_upgrades() -> Result<SocketAddr> {
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let address = listener.local_addr()?;
+    std::thread::spawn(move || {
+        for stream in listener.incoming().flatten() {
+            std::thread::spawn(move || {
+                if let Ok(mut socket) = tungstenite::accept(stream) {
+                    while socket.read().is_ok() {}
+                }
+            });
+        }
+    });
+    Ok(address)
+}
+
+fn connections_a_second(address: &str, path: &str) -> Result<f64> {
+    let url = format!("ws://{address}/{path}");
+    let began = Instant::now();
+    let come = || -> Result<u32> {
+        let mut count = 0;
+        while began.elapsed() < TIME {
+            Robot::connect(&url)?.leaves()?;
+            count += 1;
+        }
+        Ok(count)
+    };
+    let counts = std::thread::scope(|scope| {
+        let all: Vec<_> = (0..THREADS).map(|_| scope.spawn(come)).collect();
+        all.into_iter().map(joined).collect::<Result<Vec<u32>>>()
+    })?;
+    Ok(f64::from(counts.iter().sum::<u32>()) / began.elapsed().as_secs_f64())
+}

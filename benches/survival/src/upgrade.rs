@@ -1,0 +1,124 @@
+//! An upgrade: the daemon is ended, and another started in its place, while many robots are at work. Their connections end; their servants
+//! do not.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, anyhow};
+use bench_report::{Report, Target};
+use support::daemon::Setup;
+use support::robot::Robot;
+
+use crate::greeters;
+use crate::milliseconds::{median, worst};
+
+/// Servants at work.
+const SERVANTS: usize = 26;
+/// Between a robot's calls.
+const PACE: Duration = Duration::from_millis(100);
+
+/// Replaces the daemon so many times.
+pub(crate) fn measure(report: &mut Report, setup: &Setup, rounds: u32) -> Result<()> {
+    let mut alone = Vec::new();
+    for _ in 0..rounds {
+        let daemon = setup.start()?;
+        let began = Instant::now();
+        daemon.ends()?;
+        let (daemon, _) = greeters::start(setup)?;
+        alone.push(began.elapsed());
+        daemon.ends()?;
+    }
+    let mut daemon = setup.start()?;
+    let robots: Vec<String> = (0..SERVANTS)
+        .map(|number| format!("upgraded-{number}"))
+        .collect();
+    for robot in &robots {
+        greeters::greet(&mut daemon.robot(&greeters::path(robot))?)?;
+    }
+    let before = greeters::identities(&daemon, &robots)?;
+    let (mut lost, mut forgotten, mut gaps) = (0, 0, Vec::new());
+    for _ in 0..rounds {
+        let address = daemon.address.clone();
+        let over = AtomicBool::new(false);
+        daemon = std::thread::scope(|scope| -> Result<_> {
+            let work = |robot: &String| {
+                let (url, over) = (format!("ws://{address}/{}", greeters::path(robot)), &over);
+                scope.spawn(move || work_until(&url, over))
+            };
+            let at_work: Vec<_> = robots.iter().map(work).collect();
+            let next = (|| {
+                daemon.ends()?;
+                let (next, _) = greeters::start(setup)?;
+                for robot in &robots {
+                    // Each was greeted once.
+                    forgotten += u32::from(greeters::ask_again(&next, robot)? < 1);
+                }
+                Ok(next)
+            })();
+            over.store(true, Ordering::Relaxed);
+            for robot in at_work {
+                gaps.push(robot.join().map_err(|_| anyhow!("a robot panicked"))?);
+            }
+            next
+        })?;
+        lost += greeters::count_lost(&before, &greeters::identities(&daemon, &robots));
+    }
+    greeters::stop_all(&daemon)?;
+    daemon.ends()?;
+    report
+        .figure(
+            format!("{rounds} upgrades with {SERVANTS} servants at work, servants lost"),
+            "",
+            lost as f64,
+        )
+        .reach(Target::AtMost(0.0));
+    report
+        .figure(
+            "nodes that had forgotten what they knew by then",
+            "",
+            f64::from(forgotten),
+        )
+        .reach(Target::AtMost(0.0));
+    report
+        .figure(
+            "longest time between two answers to a robot",
+            "ms",
+            median(&gaps),
+        )
+        .beside("end and start of a daemon with no servants", median(&alone))
+        .note(format!(
+            "medians; at worst {:.0} ms beside {:.0} ms",
+            worst(&gaps),
+            worst(&alone)
+        ));
+    Ok(())
+}
+
+/// Asks a servant again and again, and connects again where it has to, until it is over; returns the longest time between two answers.
+fn work_until(url: &str, over: &AtomicBool) -> Duration {
+    let (mut longest, mut answered) = (Duration::ZERO, Instant::now());
+    let mut connection = None;
+    loop {
+        // Looked at before it asks: a gap that is open at the end is counted, too.
+        let is_last = over.load(Ordering::Relaxed);
+        if connection.is_none() {
+            connection = Robot::connect(url).ok();
+        }
+        if connection
+            .as_mut()
+            .is_some_and(|robot| greeters::count(robot).is_ok())
+        {
+            longest = longest.max(answered.elapsed());
+            answered = Instant::now();
+            if is_last {
+                return longest;
+            }
+        } else {
+            connection = None;
+            if is_last {
+                return longest.max(answered.elapsed());
+            }
+        }
+        std::thread::sleep(PACE);
+    }
+}
