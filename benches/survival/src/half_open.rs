@@ -8,10 +8,10 @@ use bench_report::{Report, Target};
 use ros::bus::RosVersion;
 use support::daemon::Daemon;
 use support::freezer::Freezer;
-use support::robot::Robot;
 use support::site::{Running, Site};
 use support::twins::{self, Twin};
 
+use crate::crowd::Crowd;
 use crate::greeters;
 use crate::milliseconds::{median, worst};
 use crate::resources::Resources;
@@ -51,22 +51,18 @@ pub(crate) fn measure(daemon: &Daemon, rounds: u32) -> Result<HalfOpen> {
 /// Clients that fall silent: how long the daemon has descriptors for them.
 fn lose_clients(daemon: &Daemon) -> Result<Duration> {
     // The servant stays, and what is open for it.
-    greeters::count(&mut daemon.robot(&greeters::path("half-open"))?)?;
+    let mut first = daemon.robot(&greeters::path("half-open"))?;
+    greeters::count(&mut first)?;
+    first.leaves()?;
     let before = Resources::of(daemon.pid())?.descriptors;
     let freezer = Freezer::new(&daemon.address)?;
     let url = format!("ws://{}/{}", freezer.server, greeters::path("half-open"));
-    let mut clients = Vec::new();
-    for _ in 0..CLIENTS {
-        let mut client = Robot::connect(&url)?;
-        greeters::count(&mut client)?;
-        clients.push(client);
-    }
-    let with_all = Resources::of(daemon.pid())?.descriptors;
+    let crowd = Crowd::connect(&url, CLIENTS)?;
+    let silent = freezer.freeze();
     ensure!(
-        with_all >= before + CLIENTS as f64,
-        "{with_all} descriptors after {before}"
+        silent == CLIENTS,
+        "{silent} of {CLIENTS} connections are there"
     );
-    freezer.freeze();
     let began = Instant::now();
     support::until("the end of connections that carry nothing", || {
         let now = Resources::of(daemon.pid())?.descriptors;
@@ -74,7 +70,11 @@ fn lose_clients(daemon: &Daemon) -> Result<Duration> {
             .then_some(())
             .ok_or_else(|| format!("{now} descriptors, {before} before")))
     })?;
-    Ok(began.elapsed())
+    let took = began.elapsed();
+    drop(freezer);
+    // Their own ends are told only now.
+    crowd.ask()?;
+    Ok(took)
 }
 
 /// Links that fall silent: how long until the node behind each is heard again.

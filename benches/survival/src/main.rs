@@ -12,6 +12,7 @@
 
 #![forbid(unsafe_code)]
 
+mod crowd;
 mod crowds;
 mod disk;
 mod greeters;

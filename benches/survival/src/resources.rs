@@ -6,8 +6,8 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use bench_report::{Report, Target};
 
-/// Threads that wait for more of their work end after 10 s, and give their memory back then.
-const REST: Duration = Duration::from_secs(12);
+/// Threads that wait for more of their work end after 10 s; what was freed is given back every 30 s.
+const REST: Duration = Duration::from_secs(45);
 /// Looks that make one figure, and the pause between them.
 const LOOKS: usize = 9;
 const PAUSE: Duration = Duration::from_millis(250);
@@ -19,7 +19,9 @@ const FLAT: f64 = 1.02;
 pub(crate) struct Resources {
     /// Resident megabytes (10⁶).
     pub(crate) resident: f64,
-    /// The same, what is shared counted in proportion (PSS).
+    /// Those of them that are no file's: what it allocated.
+    pub(crate) anonymous: f64,
+    /// Resident ones, what is shared counted in proportion (PSS): fewer where more processes of the program run.
     pub(crate) proportional: f64,
     /// Open descriptors.
     pub(crate) descriptors: f64,
@@ -30,11 +32,12 @@ pub(crate) struct Resources {
 impl Resources {
     /// Those of a process now.
     pub(crate) fn of(pid: i32) -> Result<Self> {
-        let resident = field(pid, "status", "VmRSS:")? * 1024.0 / 1e6;
-        let proportional = field(pid, "smaps_rollup", "Pss:")? * 1024.0 / 1e6;
+        let megabytes =
+            |file, name| Ok::<f64, anyhow::Error>(field(pid, file, name)? * 1024.0 / 1e6);
         Ok(Self {
-            resident,
-            proportional,
+            resident: megabytes("status", "VmRSS:")?,
+            anonymous: megabytes("status", "RssAnon:")?,
+            proportional: megabytes("smaps_rollup", "Pss:")?,
             descriptors: fs::read_dir(format!("/proc/{pid}/fd"))?.count() as f64,
             threads: field(pid, "status", "Threads:")?,
         })
@@ -59,6 +62,7 @@ impl Resources {
         };
         Self {
             resident: middle(|look| look.resident),
+            anonymous: middle(|look| look.anonymous),
             proportional: middle(|look| look.proportional),
             descriptors: middle(|look| look.descriptors),
             threads: middle(|look| look.threads),
@@ -69,15 +73,15 @@ impl Resources {
     pub(crate) fn tell(self, report: &mut Report, what: &str, (when, before): (&str, Self)) {
         report
             .figure(
-                format!("memory of the daemon after {what}, PSS"),
+                format!("memory of the daemon after {what}, resident"),
                 "MB",
-                self.proportional,
+                self.resident,
             )
-            .beside(when, before.proportional)
+            .beside(when, before.resident)
             .reach(Target::RatioAtMost(FLAT))
             .note(format!(
-                "resident {:.1} MB after {:.1} MB",
-                self.resident, before.resident
+                "allocated {:.1} MB after {:.1} MB; PSS {:.1} MB after {:.1} MB",
+                self.anonymous, before.anonymous, self.proportional, before.proportional
             ));
         report
             .figure(

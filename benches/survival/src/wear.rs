@@ -58,6 +58,6 @@ impl Wear {
 
 /// Says which part made the daemon hold more.
 fn say(daemon: &Daemon, after: &str) -> Result<()> {
-    eprintln!("{after}: {:?}", Resources::at_rest(daemon.pid())?);
+    eprintln!("{after}: {:?}", Resources::of(daemon.pid())?);
     Ok(())
 }

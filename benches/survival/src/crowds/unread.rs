@@ -16,6 +16,8 @@ use crate::resources::Resources;
 /// So many. They answer no pings, either, and are let go for that: what is published for them is, before that.
 const READERS: usize = 100;
 const TIME: Duration = Duration::from_secs(6);
+/// The robot whose they are.
+const UNREAD: &str = "unread";
 /// A message, in bytes, and the pause after each.
 const MESSAGE: usize = 1 << 18;
 const PACE: Duration = Duration::from_millis(50);
@@ -43,11 +45,8 @@ struct Published {
 }
 
 pub(super) fn measure(daemon: &Daemon) -> Result<Unread> {
-    let path = greeters::path("unread");
-    let mut publisher = daemon.robot(&path)?;
-    publisher.says(json!({"op": "advertise", "topic": "/unread", "type": "std_msgs/String"}))?;
-    publisher.calls("/rosapi/get_time", json!({}))?;
-    let for_nobody = publish_beside(daemon, &mut publisher)?;
+    let path = greeters::path(UNREAD);
+    let for_nobody = publish_beside(daemon)?;
     let mut readers = Vec::new();
     for _ in 0..READERS {
         let mut reader = Robot::on_a_short_line(&daemon.url(&path), &[])?;
@@ -56,7 +55,7 @@ pub(super) fn measure(daemon: &Daemon) -> Result<Unread> {
         readers.push(reader);
     }
     let before = Resources::of(daemon.pid())?.resident;
-    let for_readers = publish_beside(daemon, &mut publisher)?;
+    let for_readers = publish_beside(daemon)?;
     Ok(Unread {
         before,
         for_nobody,
@@ -65,7 +64,10 @@ pub(super) fn measure(daemon: &Daemon) -> Result<Unread> {
 }
 
 /// Publishes for a while, and calls as another robot meanwhile.
-fn publish_beside(daemon: &Daemon, publisher: &mut Robot) -> Result<Published> {
+fn publish_beside(daemon: &Daemon) -> Result<Published> {
+    let mut publisher = daemon.robot(&greeters::path(UNREAD))?;
+    publisher.says(json!({"op": "advertise", "topic": "/unread", "type": "std_msgs/String"}))?;
+    publisher.calls("/rosapi/get_time", json!({}))?;
     let message =
         json!({"op": "publish", "topic": "/unread", "msg": {"data": "x".repeat(MESSAGE)}});
     let mut robot = daemon.robot(&greeters::path("polite"))?;
