@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use bench_report::{Report, Target};
 use serde_json::json;
 use support::daemon::Daemon;
@@ -76,7 +76,9 @@ fn publish_beside(daemon: &Daemon) -> Result<Published> {
     let publish = || -> Result<u32> {
         let mut messages = 0;
         while began.elapsed() < TIME {
-            publisher.says(message.clone())?;
+            if let Err(error) = publisher.says(message.clone()) {
+                bail!("{error:#}: {:?}", publisher.hears_close());
+            }
             messages += 1;
             std::thread::sleep(PACE);
         }
