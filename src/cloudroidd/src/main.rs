@@ -14,6 +14,7 @@ mod bases;
 mod certificates;
 mod config;
 mod doctor;
+mod freed;
 mod home;
 mod machine;
 mod shim;
@@ -261,6 +262,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     let history = tokio::spawn(portal::keep_history(Arc::clone(&app)));
     let observers = tokio::spawn(portal::keep_observers(Arc::clone(&app)));
     let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
+    tokio::spawn(freed::give_back());
     if let Some((certificate, key)) = config.tls.files() {
         // The key is root's.
         let keeping = certificates::keep(Arc::clone(&app), certificate, key);

@@ -8,6 +8,7 @@ use std::sync::OnceLock;
 use serde::{Deserialize, Serialize};
 
 use crate::sys;
+pub use crate::sys::give_back_memory;
 
 /// A process that is named in a file: its number alone may be somebody else's by the time it is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

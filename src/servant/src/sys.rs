@@ -149,11 +149,38 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     }
 }
 
-/// Gives memory that was freed back to the kernel (malloc_trim(3)).
-pub(crate) fn give_back_memory() {
+/// Gives memory of this process that was freed back to the kernel (malloc_trim(3)).
+pub fn give_back_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: no pointers; may be called at any time.
     unsafe {
         libc::malloc_trim(0);
+    }
+}
+
+#[cfg(all(test, target_env = "gnu"))]
+mod tests {
+    use super::*;
+
+    /// Kilobytes of this process that are no file's.
+    fn allocated() -> u64 {
+        let status = std::fs::read_to_string("/proc/self/status").expect("/proc");
+        let line = status
+            .lines()
+            .find_map(|line| line.strip_prefix("RssAnon:"));
+        let number = line.and_then(|line| line.trim().strip_suffix(" kB"));
+        number.expect("RssAnon").trim().parse().expect("a number")
+    }
+
+    #[test]
+    fn what_was_freed_before_something_that_is_used_is_given_back() {
+        let mut many: Vec<Vec<u8>> = (0..64 << 10).map(|_| vec![1; 1 << 10]).collect();
+        let last = many.pop();
+        many.clear();
+        let held = allocated();
+        give_back_memory();
+        let left = allocated();
+        assert!(left + (32 << 10) < held, "{left} kB of {held} kB");
+        drop(last);
     }
 }
