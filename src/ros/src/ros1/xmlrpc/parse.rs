@@ -139,8 +139,8 @@ impl<'a> Parser<'a> {
 
     fn unexpected(&self, found: &Token<'_>, wanted: &str) -> Error {
         let found = match found {
-            Token::Start { name } => format!("<{name}>"),
-            Token::End(name) => format!("</{name}>"),
+            Token::Start { name } => format!("<{}>", short(name)),
+            Token::End(name) => format!("</{}>", short(name)),
             Token::Text(_) => "text".to_owned(),
             Token::Finished => "the end of the document".to_owned(),
         };
@@ -397,8 +397,12 @@ fn scalar(name: &str, text: &str) -> Result<Value, String> {
 
 /// Text for an error message: quoted, and not longer than a line.
 fn quoted(text: &str) -> String {
-    let short: String = text.chars().take(40).collect();
-    format!("{short:?}")
+    format!("{:?}", short(text))
+}
+
+/// Its first characters: who sends a document chooses how long a name in it is.
+fn short(text: &str) -> String {
+    text.chars().take(40).collect()
 }
 
 /// Replaces references to characters; an `&` that begins none stays, as XmlRpcpp leaves it.
