@@ -136,7 +136,7 @@ pub(crate) async fn make(
         }
     };
     let work = async {
-        let result = process::run(command, "mmdebstrap", |_, line| {
+        let result = process::run_in_namespaces(command, "mmdebstrap", |_, line| {
             lines.send(line.to_owned());
         })
         .await;

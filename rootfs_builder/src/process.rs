@@ -1,9 +1,10 @@
-//! Programs of the host: started without a shell, killed when their future is dropped, their last words kept.
+//! Programs of the host: started without a shell, killed when their future is dropped, their last words kept. Programs that mount have
+//! namespaces of their own.
 
 use std::collections::VecDeque;
 use std::ffi::OsStr;
 use std::path::Path;
-use std::process::Stdio;
+use std::process::{ExitStatus, Stdio};
 
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
@@ -65,10 +66,81 @@ impl Drop for Group {
 /// Runs it to its end; every line of either stream goes to `on_line` as it comes. The error has the last lines,
 /// or says how to get the program.
 pub(crate) async fn run(
+    command: Command,
+    package: &'static str,
+    on_line: impl FnMut(Stream, &str),
+) -> Result<(), Error> {
+    let program = command.as_std().get_program().to_owned();
+    let ended = end_of(command, package, on_line).await?;
+    ended.outcome(&program)
+}
+
+/// The options of unshare(1). What is mounted here is seen by nobody else, and is gone with the last process; all processes are killed when
+/// the first one ends, and that is killed with unshare itself.
+const NAMESPACES: [&str; 5] = ["--mount", "--pid", "--fork", "--kill-child", "--mount-proc"];
+
+/// The first process of the namespaces, which runs its arguments. It ends with them, or when the other end of its standard input is closed:
+/// that happens however the daemon ends, by SIGKILL too. The first process of a namespace is sent only signals that it handles.
+const FIRST_PROCESS: &str = r#"
+exec 3<&0
+trap 'exit 1' TERM
+{ cat; kill -TERM $$; } <&3 >/dev/null 2>&1 &
+"$@" </dev/null 3<&- &
+wait $!
+"#;
+
+/// The shell's status where there is no such program.
+const NOT_FOUND: i32 = 127;
+
+/// Runs a program that mounts, in a mount and a process namespace of its own: whatever looks through the file systems of this machine
+/// cannot keep its mounts busy, and none of them, nor a process that it started, outlives it or the daemon.
+pub(crate) async fn run_in_namespaces(
+    command: Command,
+    package: &'static str,
+    on_line: impl FnMut(Stream, &str),
+) -> Result<(), Error> {
+    let command = command.as_std();
+    let program = command.get_program();
+    let mut inside = self::command("unshare");
+    inside
+        .args(NAMESPACES)
+        .args(["--", "sh", "-c", FIRST_PROCESS, "sh"])
+        .arg(program)
+        .args(command.get_args())
+        .stdin(Stdio::piped());
+    for (name, value) in command.get_envs() {
+        match value {
+            Some(value) => inside.env(name, value),
+            None => inside.env_remove(name),
+        };
+    }
+    let ended = end_of(inside, "util-linux", on_line).await?;
+    if ended.status.code() == Some(NOT_FOUND) {
+        return Err(missing(program, package));
+    }
+    ended.outcome(program)
+}
+
+/// How a program has ended, and its last lines.
+struct Ended {
+    status: ExitStatus,
+    tail: Tail,
+}
+
+impl Ended {
+    fn outcome(self, program: &OsStr) -> Result<(), Error> {
+        if self.status.success() {
+            return Ok(());
+        }
+        Err(failed(program, &self.status.to_string(), self.tail.text()))
+    }
+}
+
+async fn end_of(
     mut command: Command,
     package: &'static str,
     mut on_line: impl FnMut(Stream, &str),
-) -> Result<(), Error> {
+) -> Result<Ended, Error> {
     let program = command.as_std().get_program().to_owned();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command
@@ -76,6 +148,8 @@ pub(crate) async fn run(
         .map_err(|error| spawn_error(&program, package, error))?;
     let id = child.id().and_then(|id| i32::try_from(id).ok());
     let mut group = Group(id.map(Pid::from_raw));
+    // Where it is a pipe, it stays open until the program has ended; waiting alone would close it.
+    let _input = child.stdin.take();
     let out = child.stdout.take().map(BufReader::new);
     let err = child.stderr.take().map(BufReader::new);
     let mut tail = Tail::default();
@@ -96,10 +170,7 @@ pub(crate) async fn run(
         .await
         .map_err(|error| spawn_error(&program, package, error))?;
     group.0 = None;
-    if status.success() {
-        return Ok(());
-    }
-    Err(failed(&program, &status.to_string(), tail.text()))
+    Ok(Ended { status, tail })
 }
 
 /// Runs it and gives its standard output.
@@ -140,16 +211,21 @@ fn failed(program: &OsStr, status: &str, last_lines: String) -> Error {
 
 fn spawn_error(program: &OsStr, package: &'static str, error: std::io::Error) -> Error {
     if error.kind() == std::io::ErrorKind::NotFound {
-        // Programs are named by literals; the names below are those this crate runs.
-        let program = match program.to_str() {
-            Some("mmdebstrap") => "mmdebstrap",
-            Some("dpkg-deb") => "dpkg-deb",
-            Some("pip3") => "pip3",
-            _ => "apt-get",
-        };
-        return Error::MissingProgram { program, package };
+        return missing(program, package);
     }
     Error::io("starting", program, error)
+}
+
+fn missing(program: &OsStr, package: &'static str) -> Error {
+    // Programs are named by literals; the names below are those this crate runs.
+    let program = match program.to_str() {
+        Some("mmdebstrap") => "mmdebstrap",
+        Some("unshare") => "unshare",
+        Some("dpkg-deb") => "dpkg-deb",
+        Some("pip3") => "pip3",
+        _ => "apt-get",
+    };
+    Error::MissingProgram { program, package }
 }
 
 /// Lines of a stream that may not be UTF-8 and may end lines with a carriage return.
@@ -190,6 +266,9 @@ impl<R: AsyncRead + AsyncBufReadExt + Unpin> Lines<R> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+    use std::io::Read;
+
     use super::*;
 
     fn shell(script: &str) -> Command {
@@ -238,15 +317,97 @@ mod tests {
         );
     }
 
+    /// Begins a script of a program that mounts; its last command opens `pipe` for writing.
+    async fn begin_mounting(script: &str, pipe: &Path) -> (tokio::task::JoinHandle<()>, File) {
+        nix::unistd::mkfifo(pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
+        let command = shell(script);
+        let running = tokio::spawn(async move {
+            let outcome = run_in_namespaces(command, "dash", |_, _| {}).await;
+            panic!("it is to go on until it is killed: {outcome:?}");
+        });
+        let pipe = pipe.to_owned();
+        let opening = tokio::task::spawn_blocking(move || File::open(pipe).expect("opened"));
+        (running, opening.await.expect("no panic"))
+    }
+
+    /// Waits until nobody has the other end any more.
+    async fn closed(mut pipe: File) {
+        let read = tokio::task::spawn_blocking(move || pipe.read(&mut [0]).expect("read"));
+        assert_eq!(read.await.expect("no panic"), 0, "the other end is closed");
+    }
+
+    #[tokio::test]
+    async fn what_a_program_mounts_is_seen_by_nobody_else() {
+        let place = tempfile::tempdir().expect("a directory");
+        let (tree, pipe) = (place.path().join("tree"), place.path().join("pipe"));
+        std::fs::create_dir(&tree).expect("made");
+        // One that leaves its session and its group of processes is ended, too.
+        let script = format!(
+            "mount -t tmpfs none {tree} && touch {tree}/inside && setsid sleep 1000 >{pipe}",
+            tree = tree.display(),
+            pipe = pipe.display()
+        );
+        let (running, pipe) = begin_mounting(&script, &pipe).await;
+        let mounts = std::fs::read_to_string("/proc/self/mountinfo").expect("read");
+        assert!(!mounts.contains(&*tree.to_string_lossy()), "{mounts}");
+        assert!(!tree.join("inside").exists());
+        running.abort();
+        closed(pipe).await;
+        std::fs::remove_dir(&tree).expect("nothing is mounted there");
+    }
+
+    #[tokio::test]
+    async fn a_program_that_mounts_ends_with_a_daemon_that_is_killed() {
+        let place = tempfile::tempdir().expect("a directory");
+        let pipe = place.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
+        // What the kernel does for a process that is killed: its end of the pipe is closed, and nobody kills the group.
+        let mut first = command("unshare");
+        first
+            .args(NAMESPACES)
+            .args(["sh", "-c", FIRST_PROCESS, "sh", "sh", "-c"])
+            .arg(format!("setsid sleep 1000 >{}", pipe.display()))
+            .stdin(Stdio::piped())
+            .kill_on_drop(false);
+        let mut child = first.spawn().expect("unshare, of util-linux");
+        let input = child.stdin.take();
+        let opening = tokio::task::spawn_blocking(move || File::open(pipe).expect("opened"));
+        let pipe = opening.await.expect("no panic");
+        drop(input);
+        closed(pipe).await;
+        child.wait().await.expect("it has ended");
+    }
+
+    #[tokio::test]
+    async fn a_program_in_namespaces_ends_as_it_would_outside() {
+        let run = |script: &str| run_in_namespaces(shell(script), "dash", |_, _| {});
+        run("exit 0").await.expect("success");
+        let error = run("echo why >&2; exit 3").await.expect_err("status 3");
+        let text = error.to_string();
+        assert!(text.contains("sh failed (exit status: 3)"), "{text}");
+        assert!(text.contains("why"), "{text}");
+    }
+
     #[tokio::test]
     async fn a_missing_program_is_answered_with_the_command_that_installs_it() {
-        let mut command = command("mmdebstrap");
-        command.env("PATH", "/nonexistent");
-        let error = output(command, "mmdebstrap").await.expect_err("not found");
-        assert_eq!(
-            error.to_string(),
-            "mmdebstrap is not installed: run `apt-get install mmdebstrap`"
-        );
+        let missing = |program| {
+            let place = tempfile::tempdir().expect("a directory");
+            for there in ["unshare", "sh", "cat"] {
+                let at = place.path().join(there);
+                std::os::unix::fs::symlink(format!("/usr/bin/{there}"), at).expect("linked");
+            }
+            let mut command = command(program);
+            command.env("PATH", place.path());
+            (command, place)
+        };
+        let (command, _place) = missing("mmdebstrap");
+        let error = run_in_namespaces(command, "mmdebstrap", |_, _| {}).await;
+        let expected = "mmdebstrap is not installed: run `apt-get install mmdebstrap`";
+        assert_eq!(error.expect_err("not found").to_string(), expected);
+        let (command, _place) = missing("pip3");
+        let error = output(command, "python3-pip").await.expect_err("not found");
+        let expected = "pip3 is not installed: run `apt-get install python3-pip`";
+        assert_eq!(error.to_string(), expected);
     }
 
     #[tokio::test]

@@ -162,7 +162,7 @@ async fn mmdebstraps_default(suite: &str, scratch: &Path) -> Result<String, Erro
         .args(["--mode=root", "--variant=custom", "--format=directory"]);
     ask.arg("--setup-hook=cat \"$1/etc/apt/sources.list\" > \"$LIST\"; exit 1");
     ask.arg(suite).arg(target.path().join("root"));
-    let result = process::run(ask, "mmdebstrap", |_, _| {}).await;
+    let result = process::run_in_namespaces(ask, "mmdebstrap", |_, _| {}).await;
     match (fs::read_to_string(&list), result) {
         (Ok(text), _) if !text.trim().is_empty() => Ok(text),
         (_, Err(error)) => Err(error),

@@ -170,7 +170,9 @@ pub fn base() -> anyhow::Result<PathBuf> {
     let unpack = format!(
         "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED} && dpkg -x {UNPACKED}_*.deb / && rm {UNPACKED}_*.deb'"
     );
-    let made = run(Command::new("mmdebstrap")
+    // What mmdebstrap mounts is seen by nobody else, and gone when it is killed.
+    let made = run(Command::new("unshare")
+        .args(["--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc", "mmdebstrap"])
         .args(["--quiet", "--mode=root", "--variant=minbase"])
         .arg(format!("--include={}", PACKAGES.join(",")))
         .arg("--aptopt=APT::Install-Recommends \"false\"")

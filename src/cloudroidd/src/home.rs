@@ -6,6 +6,8 @@
 //!
 //! Nobody else enters it (docs/adr/033).
 
+mod mounts;
+
 use std::fs::{File, Permissions};
 use std::io::{Read, Seek, Write};
 use std::os::fd::AsRawFd;
@@ -193,10 +195,15 @@ impl Home {
         self.path.join("run/daemon.sock")
     }
 
-    /// Removes what an earlier daemon's builds left half-made, once their containers have ended. What cannot be
-    /// removed is told and is no reason not to start.
+    /// Removes what an earlier daemon's builds left half-made, once their containers have ended, and before that
+    /// detaches what is mounted there: it may be a directory of the host. What cannot be removed is told and is no reason not to start.
     pub fn sweep_builds(&self) {
-        let entries = std::fs::read_dir(self.path.join("build"));
+        let builds = self.path.join("build");
+        if let Err(error) = mounts::detach_below(&builds) {
+            tracing::error!("cannot sweep {}: {error}", builds.display());
+            return;
+        }
+        let entries = std::fs::read_dir(&builds);
         for half_made in entries
             .into_iter()
             .flatten()

@@ -48,6 +48,15 @@ pub enum Error {
         /// The tree.
         root: PathBuf,
     },
+    /// Something is mounted in a tree that is to be removed; what is in the mount may be the host's.
+    #[error(
+        "a file system is mounted at {path}; detach it with `umount --lazy {path}`, and try again",
+        path = path.display()
+    )]
+    Mounted {
+        /// Where it is mounted.
+        path: PathBuf,
+    },
     /// The work was cancelled.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),

@@ -25,7 +25,7 @@ const HERE: ResolveFlags = ResolveFlags::BENEATH
 /// their owner may not write are made writable first.
 ///
 /// # Errors
-/// A file system is mounted in the tree, directories are moved meanwhile, or a system call fails.
+/// [`Error::Mounted`] where a file system is mounted in the tree; [`Error::File`] where directories are moved meanwhile, or a system call fails.
 pub fn remove(path: &Path) -> Result<(), Error> {
     let failed = |action, error: Errno| Error::file(action, path, error);
     let above = match path.parent() {
@@ -167,7 +167,11 @@ impl Remover<'_> {
         for name in shown.chain(if stack.is_empty() { None } else { Some(name) }) {
             path.push(std::ffi::OsStr::from_bytes(name.to_bytes()));
         }
-        Error::file(action, &path, error)
+        match error {
+            // A directory and a file that something is mounted on.
+            Errno::XDEV | Errno::BUSY => Error::Mounted { path },
+            error => Error::file(action, &path, error),
+        }
     }
 }
 
@@ -179,6 +183,7 @@ fn identity(stat: &Stat) -> (u64, u64) {
 mod tests {
     use super::*;
     use std::os::unix::fs::{PermissionsExt, symlink};
+    use std::process::Command;
 
     #[test]
     fn a_tree_of_any_depth_is_removed() {
@@ -220,6 +225,53 @@ mod tests {
         assert!(!root.exists() && outside.join("f").exists());
         remove(&root).expect("gone already");
         remove(&root.join("below/nothing")).expect("gone already");
+    }
+
+    /// Mounts are seen by the test alone: it is told once more, in a mount namespace of its own.
+    #[test]
+    fn what_is_mounted_in_a_tree_stays_and_is_named() {
+        const INSIDE: &str = "CLOUDROID_FOREIGN_PLACE";
+        let Some(place) = std::env::var_os(INSIDE) else {
+            let place = tempfile::tempdir().expect("a directory");
+            let told = Command::new("unshare")
+                .args(["--map-root-user", "--mount"])
+                .arg(std::env::current_exe().expect("this test"))
+                .args([
+                    "--exact",
+                    "remove::tests::what_is_mounted_in_a_tree_stays_and_is_named",
+                ])
+                .env(INSIDE, place.path())
+                .output()
+                .expect("unshare, of util-linux");
+            let said = String::from_utf8_lossy(&told.stdout);
+            assert!(told.status.success() && said.contains("1 passed"), "{said}");
+            return;
+        };
+        let place = PathBuf::from(place);
+        let (root, outside) = (place.join("root"), place.join("outside"));
+        std::fs::create_dir_all(root.join("a/sys")).expect("made");
+        std::fs::create_dir(&outside).expect("made");
+        std::fs::write(outside.join("f"), "the host's").expect("written");
+        for (what, point) in [(&outside, "a/sys"), (&outside.join("f"), "f")] {
+            // What is no directory goes before anything else.
+            std::fs::write(root.join("f"), "").expect("written");
+            let point = root.join(point);
+            let mounted = Command::new("mount")
+                .arg("--bind")
+                .arg(what)
+                .arg(&point)
+                .status();
+            assert!(mounted.expect("mount, of util-linux").success());
+            let refused = remove(&root)
+                .expect_err("something is mounted there")
+                .to_string();
+            let expected = format!("a file system is mounted at {}; detach it", point.display());
+            assert!(refused.starts_with(&expected), "{refused}");
+            assert!(outside.join("f").exists());
+            let detached = Command::new("umount").arg(&point).status();
+            assert!(detached.expect("umount, of util-linux").success());
+        }
+        remove(&root).expect("removed");
     }
 
     #[test]

@@ -194,6 +194,14 @@ impl From<foreign::Error> for Error {
                 path,
                 source: io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"),
             },
+            foreign::Error::Mounted { path } => Self::File {
+                action: "remove",
+                path,
+                source: io::Error::new(
+                    io::ErrorKind::ResourceBusy,
+                    "a file system is mounted there; detach it with umount --lazy",
+                ),
+            },
             foreign::Error::Cancelled(cancelled) => Self::File {
                 action: "read",
                 path: PathBuf::new(),
