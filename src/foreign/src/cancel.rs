@@ -67,6 +67,11 @@ impl Drop for CancelOnDrop {
     }
 }
 
+/// The flag that the current thread works under, for threads that it starts to work under it, too.
+pub fn current() -> Option<Cancel> {
+    CURRENT.with_borrow(Option::clone)
+}
+
 /// Fails if the work of the current thread was cancelled.
 pub fn check() -> Result<(), Cancelled> {
     let cancelled =
@@ -85,8 +90,10 @@ mod tests {
             let gone = inner.on_drop();
             inner.during(|| {
                 assert_eq!(check(), Ok(()));
+                let current = current().expect("this one");
                 drop(gone);
                 assert_eq!(check(), Err(Cancelled));
+                assert!(current.is_cancelled());
             });
             assert_eq!(check(), Ok(()));
         });

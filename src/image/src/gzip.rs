@@ -175,14 +175,15 @@ pub(crate) fn decoder<'a>(input: impl Read + Send + 'a) -> io::Result<Box<dyn Re
     }
 }
 
-/// Runs `consume` with a reader whose bytes another thread reads ahead from `input`.
+/// Runs `consume` with a reader whose bytes another thread reads ahead from `input`. That thread may read and do nothing else: it
+/// decompresses what strangers have written.
 pub(crate) fn reading_ahead<R: Read + Send, T>(
     mut input: R,
     consume: impl FnOnce(&mut dyn Read) -> T,
 ) -> T {
     let (chunks, received) = sync_channel::<io::Result<Vec<u8>>>(8);
     thread::scope(|scope| {
-        scope.spawn(move || {
+        privilege::reading_beside(scope, move || {
             loop {
                 let mut chunk = vec![0; CHUNK];
                 let read = fill(&mut input, &mut chunk);
@@ -264,6 +265,26 @@ mod tests {
         let mut back = Vec::new();
         reading_ahead(decoder, |input| input.read_to_end(&mut back)).unwrap();
         assert!(back == bytes);
+    }
+
+    /// Who the thread is that reads from it.
+    struct Asked(Option<u32>);
+
+    impl Read for Asked {
+        fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
+            self.0 = Some(rustix::process::geteuid().as_raw());
+            Ok(0)
+        }
+    }
+
+    #[test]
+    fn what_is_read_ahead_is_read_without_roots_rights() {
+        let told = crate::by_engine(|| {
+            let mut asked = Asked(None);
+            reading_ahead(&mut asked, |content| io::copy(content, &mut io::sink())).expect("read");
+            (asked.0, rustix::process::geteuid().as_raw())
+        });
+        assert_eq!(told, (Some(privilege::DEFAULT_USER), 0));
     }
 
     #[test]

@@ -233,6 +233,19 @@ impl Store {
         }))
     }
 
+    /// Whether a blob is one of an image's: its manifest, its configuration or one of its layers. Digests elsewhere in the manifest, such
+    /// as in annotations, are what whoever pushed it has written.
+    pub fn has_blob(&self, image: &Digest, blob: &Digest) -> Result<bool, Error> {
+        if image == blob {
+            return Ok(true);
+        }
+        let manifest = self.read_manifest(image)?;
+        Ok(manifest.is_some_and(|manifest| {
+            let mut parts = manifest.layers.iter().chain([&manifest.config]);
+            parts.any(|part| part.digest == *blob)
+        }))
+    }
+
     pub(crate) fn read_manifest(&self, digest: &Digest) -> Result<Option<oci::Manifest>, Error> {
         self.parsed(digest)
     }
@@ -331,5 +344,43 @@ fn manifest(spec: &ImageSpec, config: Descriptor) -> oci::Manifest {
             .map(|layer| Descriptor::new(oci::MEDIA_LAYER_GZIP, layer.digest, layer.size))
             .collect(),
         annotations: spec.annotations.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TreeOptions;
+
+    #[test]
+    fn what_a_manifest_only_mentions_is_not_part_of_its_image() {
+        let place = tempfile::tempdir().expect("a directory");
+        let store = Store::open(&place.path().join("images"), &place.path().join("layers"));
+        let store = store.expect("a store");
+        let layer = |name: &str| {
+            let tree = place.path().join(name);
+            std::fs::create_dir_all(tree.join(name)).expect("made");
+            let layer = store.layer_from_tree(&tree, &TreeOptions::default());
+            layer.expect("a layer")
+        };
+        let (own, other) = (layer("own"), layer("other"));
+        let annotations = BTreeMap::from([("note".to_owned(), other.digest.to_string())]);
+        let spec = ImageSpec {
+            layers: vec![own],
+            annotations,
+            ..ImageSpec::default()
+        };
+        let image = store.put_image(&spec).expect("an image");
+        let manifest = store.manifest(&image.to_string()).expect("read");
+        let text = String::from_utf8(manifest.expect("there").bytes).expect("text");
+        assert!(text.contains(&other.digest.to_string()), "{text}");
+        let config = store.read_manifest(&image).expect("read");
+        let config = config.expect("there").config.digest;
+        for part in [image, config, own.digest] {
+            assert!(store.has_blob(&image, &part).expect("read"), "{part}");
+        }
+        assert!(!store.has_blob(&image, &other.digest).expect("read"));
+        // An image that is gone has itself alone.
+        assert!(!store.has_blob(&own.diff_id, &own.digest).expect("read"));
     }
 }

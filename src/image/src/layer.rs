@@ -138,9 +138,11 @@ impl Store {
     ) -> Result<(LayerInfo, u64), Error> {
         let mut entries = 0;
         let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
-            let content = gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
-            let (digest, bytes, counted) =
-                gzip::reading_ahead(content, |content| walk(content, label, limits))?;
+            let (digest, bytes, counted) = by_reader(|| {
+                let content =
+                    gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
+                gzip::reading_ahead(content, |content| walk(content, label, limits))
+            })?;
             entries = counted;
             Ok((digest, bytes))
         };
@@ -266,6 +268,12 @@ impl Store {
     }
 }
 
+/// Does what parses strangers' bytes on a thread that may read and do nothing else; it ends with the work that calls this.
+pub(crate) fn by_reader<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    let cancel = foreign::cancel::current().unwrap_or_default();
+    privilege::reading(|| cancel.during(work))
+}
+
 /// Reads a layer to its end: digest and bytes of the tar stream inside.
 pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, u64)> {
     let content = gzip::decoder(archive)?;
@@ -277,7 +285,7 @@ pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, 
     })
 }
 
-/// The same of the content of a layer that strangers have written, with the number of its entries.
+/// The same of the content of a layer that strangers have written, with the number of its headers.
 fn walk(
     content: &mut dyn Read,
     label: &Path,
@@ -289,15 +297,13 @@ fn walk(
     };
     let most = limits.bytes.saturating_add(1);
     let mut reader = TarReader::new(Hashing::new(content.take(most)));
-    let mut entries = 0;
     let mut last = String::new();
     let walked = loop {
         match reader.next_entry() {
             Ok(None) => break Ok(()),
             Ok(Some(entry)) => {
-                entries += 1;
                 last = shown(&entry.name);
-                if entries > limits.entries {
+                if reader.headers() > limits.entries {
                     return Err(refused(Refusal::TooManyEntries {
                         entry: last,
                         limit: limits.entries,
@@ -307,6 +313,7 @@ fn walk(
             Err(stop) => break Err(Error::stopped(&label.display().to_string(), label, stop)),
         }
     };
+    let headers = reader.headers();
     let mut rest = reader.into_inner();
     // What follows the end mark counts for the digest.
     let read = match walked.is_ok() {
@@ -322,7 +329,7 @@ fn walk(
     }
     walked?;
     read.map_err(|error| malformed(label, error))?;
-    Ok((digest, bytes, entries))
+    Ok((digest, bytes, headers))
 }
 
 /// The media type promises gzip, so nothing else is let in.

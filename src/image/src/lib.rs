@@ -49,3 +49,14 @@ pub use received::{Received, document, is_layout};
 pub use refusal::Refusal;
 pub use store::{Blob, Hold, Store};
 pub use unpack::{Limits, Unpacked, unpack};
+
+/// Does `work` on a thread of the engine, as the daemon does; for tests, of which all share one engine.
+#[cfg(test)]
+fn by_engine<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    static ENGINE: std::sync::OnceLock<privilege::Engine> = std::sync::OnceLock::new();
+    ENGINE.get_or_init(|| {
+        let engine = privilege::Engine::start(privilege::Account::default());
+        engine.expect("threads; run this test as root")
+    });
+    privilege::now(work)
+}

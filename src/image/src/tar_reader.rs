@@ -1,7 +1,9 @@
 //! Reads tar streams (ustar, GNU and pax) entry by entry, from whoever sent them.
 //!
-//! Not the `tar` crate's reader, because that one holds an extended header in memory whatever its size, takes a
-//! stream without an end mark for complete, and ignores pax sizes in raw mode; only its header fields are used.
+//! Not the `tar` crate's reader: weighed again at its version 0.4.46, it reads an extended header into memory whatever its
+//! size, and takes a stream without an end mark for complete. Neither can be mended from outside, since it reads
+//! extended headers before it gives an entry; in raw mode, which gives them one by one, it ignores the sizes that pax states. Only its
+//! header fields are used here.
 
 use std::io::{self, Read};
 
@@ -12,8 +14,11 @@ use crate::entry::{Entry, Kind, shown};
 
 const BLOCK: usize = 512;
 
-/// The largest extended header: far beyond a path and all attributes a file can have (64 KiB each name).
+/// The most bytes in all extended headers of one entry: far beyond a path and all attributes a file can have (64 KiB each name).
 const MAX_EXTENSION: u64 = 1 << 20;
+
+/// The most extended headers of one entry. Writers need three: a pax header, and GNU's for a name and for a link.
+const MAX_EXTENSIONS: u64 = 8;
 
 /// Why reading stopped.
 #[derive(Debug)]
@@ -37,6 +42,8 @@ pub(crate) struct TarReader<R> {
     remaining: u64,
     /// Zero bytes that fill up its last block.
     padding: u64,
+    /// Headers that were read, extended ones among them.
+    headers: u64,
     /// For messages: the entry being read.
     last: Vec<u8>,
 }
@@ -44,6 +51,10 @@ pub(crate) struct TarReader<R> {
 /// What extended headers say about the entry that follows.
 #[derive(Default)]
 struct Extension {
+    /// How many there were.
+    headers: u64,
+    /// Bytes in them.
+    bytes: u64,
     name: Option<Vec<u8>>,
     link: Option<Vec<u8>>,
     size: Option<u64>,
@@ -59,8 +70,14 @@ impl<R: Read> TarReader<R> {
             input,
             remaining: 0,
             padding: 0,
+            headers: 0,
             last: Vec::new(),
         }
+    }
+
+    /// How many headers were read, extended ones among them: each takes as much work as an entry.
+    pub(crate) fn headers(&self) -> u64 {
+        self.headers
     }
 
     /// The next entry; none at the end mark. What was not read of the present one is skipped.
@@ -72,11 +89,20 @@ impl<R: Read> TarReader<R> {
                 return Ok(None);
             };
             let size = header.entry_size().map_err(|error| self.malformed(error))?;
-            match header.entry_type().as_byte() {
-                b'L' => extension.name = Some(self.long_name(size)?),
-                b'K' => extension.link = Some(self.long_name(size)?),
+            let kind = header.entry_type().as_byte();
+            if matches!(kind, b'L' | b'K' | b'x' | b'g') {
+                extension.headers += 1;
+                if extension.headers > MAX_EXTENSIONS {
+                    let problem =
+                        format!("an entry of more than {MAX_EXTENSIONS} extended headers");
+                    return Err(self.malformed(problem));
+                }
+            }
+            match kind {
+                b'L' => extension.name = Some(self.long_name(size, &mut extension.bytes)?),
+                b'K' => extension.link = Some(self.long_name(size, &mut extension.bytes)?),
                 b'x' => {
-                    let records = self.extension(size)?;
+                    let records = self.extension(size, &mut extension.bytes)?;
                     self.pax(&records, &mut extension)?;
                 }
                 // Global headers carry comments (git archive); nobody puts paths there.
@@ -146,6 +172,7 @@ impl<R: Read> TarReader<R> {
         if block.iter().all(|&byte| byte == 0) {
             return Ok(None);
         }
+        self.headers += 1;
         // The sum is taken with the eight bytes of its own field as spaces.
         let sum: u32 = block[..148]
             .iter()
@@ -159,10 +186,12 @@ impl<R: Read> TarReader<R> {
         }
     }
 
-    /// The content of an extended header.
-    fn extension(&mut self, size: u64) -> Result<Vec<u8>, Stop> {
-        if size > MAX_EXTENSION {
-            return Err(self.malformed(format!("an extended header of {size} bytes")));
+    /// The content of an extended header; `sum` counts those of one entry.
+    fn extension(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, Stop> {
+        *sum = sum.saturating_add(size);
+        if *sum > MAX_EXTENSION {
+            let problem = format!("an entry with extended headers of {sum} bytes");
+            return Err(self.malformed(problem));
         }
         self.expect(size);
         let mut bytes = vec![0; size as usize];
@@ -172,8 +201,8 @@ impl<R: Read> TarReader<R> {
         Ok(bytes)
     }
 
-    fn long_name(&mut self, size: u64) -> Result<Vec<u8>, Stop> {
-        let mut name = self.extension(size)?;
+    fn long_name(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, Stop> {
+        let mut name = self.extension(size, sum)?;
         if name.last() == Some(&0) {
             name.pop();
         }
@@ -303,3 +332,6 @@ impl<R: Read> Read for TarReader<R> {
         Ok(read)
     }
 }
+
+#[cfg(test)]
+pub(crate) mod tests;

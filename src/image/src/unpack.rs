@@ -20,7 +20,7 @@ use crate::{Error, Refusal, files};
 /// How much an archive may hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Files, directories and links.
+    /// Files, directories and links; extended headers count as much.
     pub entries: u64,
     /// Bytes of the uncompressed archive.
     pub bytes: u64,
@@ -159,7 +159,7 @@ impl<R: Read> Unpacker<'_, R> {
 
     fn entry(&mut self, entry: &Entry) -> Result<(), Error> {
         self.done.entries += 1;
-        if self.done.entries > self.limits.entries {
+        if self.reader.headers() > self.limits.entries {
             return Err(refused(Refusal::TooManyEntries {
                 entry: shown(&entry.name),
                 limit: self.limits.entries,

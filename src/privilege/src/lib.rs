@@ -18,7 +18,7 @@ mod reading;
 
 pub use confine::{Account, DEFAULT_USER, KEPT, confine, limit, only};
 pub use engine::{Engine, Task, blocking, confined, now, run};
-pub use reading::reading;
+pub use reading::{reading, reading_beside};
 
 /// Why a thread does not have the rights that it should have.
 #[derive(Debug, thiserror::Error)]

@@ -305,7 +305,7 @@ fn take_in(
         ..image::Limits::default()
     };
     let received = store.receive(&layout, &bounds).map_err(unreceivable)?;
-    let record = ServiceRecord::read(&layout, &received.annotations)?;
+    let record = privilege::reading(|| ServiceRecord::read(&layout, &received.annotations))?;
     let inventory = inventory(store, &received, &record)?;
     let options = record.options(asked)?;
     let nodes = record.plan.nodes.iter().map(launched).collect();

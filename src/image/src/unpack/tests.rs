@@ -425,7 +425,7 @@ fn sparse_files_and_endless_headers_are_refused() {
     let mut endless = Entry::new("x", Kind::Other(b'x'), 0o644);
     endless.size = 1 << 32;
     archive.0.header(&endless).unwrap();
-    assert_says(&refusal(archive), &["extended header of 4294967296 bytes"]);
+    assert_says(&refusal(archive), &["extended headers of 4294967296 bytes"]);
 }
 
 #[test]
@@ -449,4 +449,23 @@ fn a_source_that_fails_leaves_nothing() {
         &["cannot read the archive", "connection reset"],
     );
     assert!(!place.destination.exists());
+}
+
+#[test]
+fn extended_headers_count_as_entries() {
+    use crate::tar_reader::tests::{extension, member};
+    let mut bytes = Vec::new();
+    for name in ["one", "two", "three"] {
+        bytes.extend(extension(1));
+        bytes.extend(member(tar::EntryType::Regular, name, b"content"));
+    }
+    bytes.extend([0; 1024]);
+    let within = |entries| Limits {
+        entries,
+        ..Limits::default()
+    };
+    let place = place();
+    let unpacked = unpack(&bytes[..], &place.destination, &within(6)).unwrap();
+    assert_eq!(unpacked.entries, 3);
+    assert_says(&refusal_within(&bytes, &within(5)), &["three", "at most 5"]);
 }
