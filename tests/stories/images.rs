@@ -214,7 +214,25 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     );
     let typed = ["--server", &server, "--token", &admin, "import", &hers];
     types(&typed)?.failed_saying(&["was not exported from a service"])?;
+    is_pulled_with_a_token(&other.address.to_string(), &eve, &at("pulled"))?;
     other.ends()?;
+    Ok(())
+}
+
+/// What clients of registries do: they ask, are challenged, and ask again with a password, which is a token.
+fn is_pulled_with_a_token(address: &str, token: &str, to: &str) -> Verdict {
+    let image = format!("docker://{address}/sevens:latest");
+    let pulls = |words: &[&str]| {
+        let mut skopeo = Command::new("skopeo");
+        skopeo.args(["--insecure-policy", "copy", "--src-tls-verify=false"]);
+        run(skopeo.args(words).args([&image, &format!("dir:{to}")]))
+    };
+    pulls(&["--src-creds", &format!("cluster:{token}")])?.succeeded()?;
+    for words in [&["--src-no-creds"][..], &["--src-creds", "cluster:guessed"]] {
+        let refused = pulls(words)?;
+        let said = refused.said().to_lowercase();
+        ensure!(refused.status != 0 && said.contains("auth"), "{words:?}: {said}");
+    }
     Ok(())
 }
 

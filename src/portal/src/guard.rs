@@ -28,6 +28,7 @@ use parking_lot::Mutex;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::oci;
 use crate::people::cookies;
 use crate::principals::{Identity, Recognising, Shown, Uncertified};
 use crate::routes::{self, Access};
@@ -112,7 +113,11 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
                 app.audit
                     .record_sparingly(&nobody, Action::Enter, &did, &object, status);
             }
-            error.into_response()
+            if oci::is_registrys(request.uri().path()) {
+                oci::not_let_in(&error)
+            } else {
+                error.into_response()
+            }
         }
     }
 }
@@ -256,18 +261,28 @@ pub fn is_upgrade(headers: &HeaderMap) -> bool {
         .is_some_and(|upgrade| upgrade.eq_ignore_ascii_case("websocket"))
 }
 
+/// The token of `Authorization`: `Bearer` everywhere. At the registry, whose clients have nothing else, also the password of `Basic`, whatever
+/// the name beside it is. Browsers send that by themselves once somebody has given it: nothing is changed there.
+fn authorization(uri: &Uri, headers: &HeaderMap) -> Option<String> {
+    let (scheme, sent) = header_text(headers, header::AUTHORIZATION)?.split_once(' ')?;
+    let sent = sent.trim();
+    if scheme.eq_ignore_ascii_case("bearer") {
+        return Some(sent.to_owned());
+    }
+    if scheme.eq_ignore_ascii_case("basic") && oci::is_registrys(uri.path()) {
+        let pair = base64_simd::STANDARD.decode_to_vec(sent).ok()?;
+        let (_, password) = std::str::from_utf8(&pair).ok()?.split_once(':')?;
+        return Some(password.to_owned());
+    }
+    None
+}
+
 fn token_in(uri: &Uri, headers: &HeaderMap) -> Option<String> {
-    let bearer = header_text(headers, header::AUTHORIZATION).and_then(|value| {
-        let (scheme, token) = value.split_once(' ')?;
-        scheme
-            .eq_ignore_ascii_case("bearer")
-            .then(|| token.trim().to_owned())
-    });
     let protocol = || {
         let token = protocols(headers).find_map(|protocol| protocol.strip_prefix(BEARER))?;
         Some(token.to_owned())
     };
-    bearer
+    authorization(uri, headers)
         .or_else(protocol)
         .or_else(|| query(uri.query(), "token"))
 }

@@ -4,19 +4,29 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
-use axum::http::{HeaderName, Method, StatusCode, Uri, header};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde_json::json;
 use tokio_util::io::ReaderStream;
 
 use crate::app::App;
-use crate::errors::Error;
+use crate::errors::{self, Error};
 use crate::guard::Caller;
 
 const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 const CHUNK: usize = 256 << 10;
+
+/// How clients of registries ask people for a token: as the password of any name (RFC 7617). A challenge for bearer tokens would need the
+/// address of a server that makes them, and the daemon's are made by an operator.
+const CHALLENGE: HeaderValue =
+    HeaderValue::from_static(r#"Basic realm="cloudroid", charset="UTF-8""#);
+
+/// Whether an address is the registry's.
+pub fn is_registrys(path: &str) -> bool {
+    path == "/v2" || path.starts_with("/v2/")
+}
 
 /// `/v2/`: yes, this is a registry.
 pub async fn version() -> Response {
@@ -107,18 +117,24 @@ pub async fn blob(
         ));
     };
     // Blobs lie in one place; who is not told of every service gets those alone that are of this one.
-    let images: Option<Vec<String>> = match caller.who.principal.sees_all() {
-        true => None,
-        false => {
-            let revisions = app.state.revisions(&name)?.into_iter();
-            Some(revisions.map(|revision| revision.image).collect())
-        }
+    let images: Option<Vec<image::Digest>> = if caller.who.principal.sees_all() {
+        None
+    } else {
+        let revisions = app.state.revisions(&name)?.into_iter();
+        Some(
+            revisions
+                .filter_map(|revision| revision.image.parse().ok())
+                .collect(),
+        )
     };
     let store = Arc::clone(app.catalogue.images());
     let found = privilege::blocking(move || {
-        if let Some(images) = images
-            && !is_of(&store, &images, &parsed)?
-        {
+        for image in images.iter().flatten() {
+            if store.has_blob(image, &parsed)? {
+                return store.blob(&parsed);
+            }
+        }
+        if images.is_some() {
             return Ok(None);
         }
         store.blob(&parsed)
@@ -138,28 +154,6 @@ pub async fn blob(
         (CONTENT_DIGEST, digest),
     ];
     Ok((headers, Body::from_stream(stream)).into_response())
-}
-
-/// Whether a blob is one of these images: its manifest, or named there.
-fn is_of(
-    store: &image::Store,
-    images: &[String],
-    blob: &image::Digest,
-) -> Result<bool, image::Error> {
-    let digest = blob.to_string();
-    for image in images {
-        let manifest = store.manifest(image)?;
-        let names = |bytes: &[u8]| holds(bytes, digest.as_bytes());
-        if *image == digest || manifest.is_some_and(|manifest| names(&manifest.bytes)) {
-            return Ok(true);
-        }
-    }
-    Ok(false)
-}
-
-/// Whether a text is part of another.
-fn holds(text: &[u8], part: &[u8]) -> bool {
-    text.windows(part.len()).any(|window| window == part)
 }
 
 /// Anything else: pushing by this interface, for one, is not offered.
@@ -183,6 +177,21 @@ pub fn other_method(method: &Method, uri: &Uri) -> Response {
     )
 }
 
+/// Why a request is not let in, as clients of registries read it.
+pub fn not_let_in(error: &Error) -> Response {
+    let problem = error.problem();
+    let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+    if status != StatusCode::UNAUTHORIZED {
+        return errors::respond(&problem);
+    }
+    let detail = problem.detail;
+    let message = format!("{detail}; log in with a token as the password, under any name");
+    let mut response = refused(status, "UNAUTHORIZED", &message);
+    let headers = response.headers_mut();
+    headers.insert(header::WWW_AUTHENTICATE, CHALLENGE);
+    response
+}
+
 fn unknown(code: &str, message: &str) -> Response {
     refused(StatusCode::NOT_FOUND, code, message)
 }
@@ -193,4 +202,26 @@ fn refused(status: StatusCode, code: &str, message: &str) -> Response {
         Json(json!({ "errors": [{ "code": code, "message": message }] })),
     )
         .into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn clients_of_registries_are_asked_for_a_password_in_their_words() {
+        let response = not_let_in(&Error::Unauthorised("a token is needed"));
+        assert_eq!(response.status(), StatusCode::UNAUTHORIZED);
+        // One that names `Bearer` without the address of a server for tokens ends skopeo and containerd.
+        let challenges = response.headers().get_all(header::WWW_AUTHENTICATE);
+        assert_eq!(challenges.iter().collect::<Vec<_>>(), [&CHALLENGE]);
+        let body = axum::body::to_bytes(response.into_body(), 4096).await;
+        let body: serde_json::Value =
+            serde_json::from_slice(&body.expect("a body")).expect("a document");
+        assert_eq!(body["errors"][0]["code"], "UNAUTHORIZED");
+        let slowed = Error::from(crate::principals::Unrecognised::Slowed(3_001));
+        let response = not_let_in(&slowed);
+        assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
+        assert_eq!(response.headers()[header::RETRY_AFTER], "4");
+    }
 }

@@ -284,6 +284,47 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
 }
 
 #[test]
+fn at_the_registry_a_token_is_the_password_of_any_name() {
+    let some = tokens();
+    let rules = Rules {
+        loopback: false,
+        known: Recognising {
+            tokens: &some,
+            stored: &Stored::default(),
+            guesses: &Mutex::new(Guesses::default()),
+            lasting: Lasting::default(),
+        },
+        origins: &[],
+    };
+    let basic = |pair: &str| {
+        let sent = base64_simd::STANDARD.encode_to_string(pair);
+        ask(&rules).with("authorization", &format!("Basic {sent}"))
+    };
+    for path in ["/v2", "/v2/", "/v2/_catalog", "/v2/x/manifests/latest"] {
+        for name in ["", "cluster", "token"] {
+            let known = basic(&format!("{name}:open sesame")).at(path);
+            let known = known.expect(path);
+            assert_eq!(known.who.token, Some(tokens::hash("open sesame")));
+        }
+    }
+    for wrong in [
+        "open sesame:",
+        "x:open",
+        "open sesame",
+        "x:open sesame ",
+        "\u{ff}",
+    ] {
+        assert_eq!(basic(wrong).at("/v2/"), Err(401), "{wrong}");
+    }
+    let unreadable = ask(&rules).with("authorization", "Basic *");
+    assert_eq!(unreadable.at("/v2/"), Err(401));
+    // Browsers keep a password and send it by themselves: elsewhere it counts for nothing.
+    for path in ["/api/v1/services", "/metrics", "/v2x", "/v1/v2/"] {
+        assert_eq!(basic("x:open sesame").at(path), Err(401), "{path}");
+    }
+}
+
+#[test]
 fn without_a_token_only_the_page_health_and_handshakes_are_open() {
     let some = tokens();
     let rules = Rules {
