@@ -273,6 +273,12 @@ impl Apt {
         if names.is_empty() {
             return Ok(Vec::new());
         }
+        if let Some(name) = names.iter().find(|name| !may_be_asked(name)) {
+            return Err(Error::Unsolvable {
+                wanted: name.clone(),
+                words: "it is not the name of a Debian package".to_owned(),
+            });
+        }
         let status = status.map_or_else(|| self.root.join("empty-status"), Path::to_owned);
         // As told by what it would fetch, which is in the order of unpacking. A simulated installation tells the same and
         // takes five times as long: it goes through all packages after each.
@@ -420,6 +426,16 @@ impl Apt {
         parts.sort();
         crate::key::sha256(parts.join("\n").as_bytes())
     }
+}
+
+/// Whether apt, which runs with the rights of root, takes a word for a package of the archive (Debian policy, 5.6.1), and not for a file of
+/// this machine (`./x.deb`), a pattern, or another version or release. One pattern is this crate's own.
+fn may_be_asked(name: &str) -> bool {
+    let fits = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit();
+    let mut bytes = name.bytes();
+    name == "?essential"
+        || bytes.next().is_some_and(fits)
+            && bytes.all(|byte| fits(byte) || matches!(byte, b'+' | b'-' | b'.'))
 }
 
 /// How long ago it was changed.

@@ -60,12 +60,7 @@ pub(crate) fn resolve(
 ) -> Result<Resolved, Error> {
     let find = |key: &str, there: &BTreeSet<String>| -> Found {
         if let Some(deb) = map.get(key) {
-            return Found::Debs(
-                deb.split([',', ' '])
-                    .filter(|deb| !deb.is_empty())
-                    .map(str::to_owned)
-                    .collect(),
-            );
+            return Found::Debs(names_in(deb).map(str::to_owned).collect());
         }
         if let Some(debs) = base.keys.get(key) {
             return Found::Debs(debs.clone());
@@ -125,19 +120,52 @@ pub(crate) fn resolve(
         }
     }
     // What the deployer wrote may be wrong as well.
+    add_unknown(archive, map, &mut missing);
+    refuse_missing(archive, base, missing)?;
+    Ok(resolved)
+}
+
+/// The Debian packages that a deployer names with `--map`, of which each must be the archive's: apt would take other words for files of
+/// this machine, patterns, or packages to be removed.
+pub(crate) fn mapped(
+    archive: &Archive,
+    base: &Base,
+    map: &BTreeMap<String, String>,
+) -> Result<BTreeSet<String>, Error> {
+    let mut unknown = BTreeMap::new();
+    add_unknown(archive, map, &mut unknown);
+    refuse_missing(archive, base, unknown)?;
+    let names = map.values().flat_map(|debs| names_in(debs));
+    Ok(names.map(str::to_owned).collect())
+}
+
+/// Names in one value of `--map`.
+fn names_in(debs: &str) -> impl Iterator<Item = &str> {
+    debs.split([',', ' ']).filter(|deb| !deb.is_empty())
+}
+
+/// Adds what `--map` names and the archive has not, with the option that names it.
+fn add_unknown(
+    archive: &Archive,
+    map: &BTreeMap<String, String>,
+    missing: &mut BTreeMap<String, BTreeSet<String>>,
+) {
     for (key, debs) in map {
-        for deb in debs
-            .split([',', ' '])
-            .filter(|deb| !deb.is_empty() && !archive.candidates.contains(deb))
-        {
-            missing
-                .entry(deb.to_owned())
-                .or_default()
-                .insert(format!("--map {key}={debs}"));
+        for deb in names_in(debs).filter(|deb| !archive.candidates.contains(deb)) {
+            let by = missing.entry(deb.to_owned()).or_default();
+            by.insert(format!("--map {key}={debs}"));
         }
     }
+}
+
+/// An error that names all that is missing, if anything is.
+fn refuse_missing(
+    archive: &Archive,
+    base: &Base,
+    missing: BTreeMap<String, BTreeSet<String>>,
+) -> Result<(), Error> {
     if missing.is_empty() {
-        return Ok(resolved);
+        return Ok(());
     }
     Err(Error::Unresolved(
         missing
@@ -282,6 +310,37 @@ mod tests {
         // No development packages at run time, and nothing that only builds.
         assert_eq!(resolved.run, set(&["libfrob3", "python3-six"]));
         assert_eq!(resolved.run_ros, set(&["tf"]));
+    }
+
+    #[test]
+    fn nothing_is_mapped_but_to_packages_of_the_archive() {
+        let lab = lab();
+        let map = |debs: &str| BTreeMap::from([("frob".to_owned(), debs.to_owned())]);
+        let mapped = |debs: &str| mapped(&lab.archive, &lab.base, &map(debs));
+        let found = mapped("libfrob3, libtf-dev").expect("both are there");
+        assert_eq!(found, set(&["libfrob3", "libtf-dev"]));
+        // Files of this machine, what apt would remove, other releases and versions, patterns, tasks.
+        for wrong in [
+            "./own.deb",
+            "/tmp/own.deb",
+            "libfrob3,../own.deb",
+            "libfrob3-",
+            "libfrob3/sid",
+            "libfrob3=1",
+            "libfrob3:armhf",
+            "?essential",
+            "~nlib",
+            "lib.*",
+            "frob^",
+            "-o",
+        ] {
+            let error = mapped(wrong).expect_err(wrong).to_string();
+            let name = wrong.split(',').next_back().unwrap_or(wrong);
+            assert!(
+                error.contains(&format!("{name} (wanted by --map frob={wrong})")),
+                "{error}"
+            );
+        }
     }
 
     #[test]

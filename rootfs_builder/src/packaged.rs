@@ -23,6 +23,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
         return of_two(build, name).await;
     }
     let archive = &build.archive;
+    let mapped = keys::mapped(archive, &build.base, &build.request.map)?;
     let (mut roots, mut debs) = build.extra_packages().await?;
     let packages: Vec<String> = if !archive.contents.ros_package(name).is_empty() {
         vec![name.to_owned()]
@@ -62,15 +63,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
         .await;
     let wanted = wanted(build, &roots, true).await?;
     debs.extend(wanted.install);
-    debs.extend(
-        build
-            .request
-            .map
-            .values()
-            .flat_map(|debs| debs.split([',', ' ']))
-            .map(str::to_owned),
-    );
-    debs.remove("");
+    debs.extend(mapped);
     let versions = packages.iter();
     let versions = versions.map(|package| (package.clone(), version(build, package)));
     let versions = versions.collect();
@@ -92,9 +85,11 @@ async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
     let (_, mut debs) = build.extra_packages().await?;
     let version = build.archive.candidates.get(&deb);
     debs.insert(deb);
-    let mapped = build.request.map.values();
-    let mapped = mapped.flat_map(|debs| debs.split([',', ' ']));
-    debs.extend(mapped.filter(|deb| !deb.is_empty()).map(str::to_owned));
+    debs.extend(keys::mapped(
+        &build.archive,
+        &build.base,
+        &build.request.map,
+    )?);
     let dependencies = build
         .add("dependencies", &build.on_base(), &debs, Vec::new())
         .await?;

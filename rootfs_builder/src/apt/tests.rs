@@ -261,3 +261,33 @@ async fn packages_in_the_cache_are_not_fetched_again() {
         [file]
     );
 }
+
+#[tokio::test]
+async fn apt_is_asked_for_names_alone() {
+    let place = tempfile::tempdir().expect("a directory");
+    let apt = Apt::open(place.path(), "").expect("prepared");
+    for wrong in [
+        "./own.deb",
+        "/tmp/own.deb",
+        "a/sid",
+        "a=1",
+        "a:armhf",
+        "~na",
+        "?true",
+        "-o",
+        "",
+    ] {
+        let names = BTreeSet::from([wrong.to_owned()]);
+        let error = apt
+            .resolve(None, &names)
+            .await
+            .expect_err(wrong)
+            .to_string();
+        assert!(
+            error.contains("not the name of a Debian package"),
+            "{error}"
+        );
+    }
+    let good = ["libstdc++6", "libfoo2.0-dev", "0ad", "?essential"];
+    assert!(good.into_iter().all(may_be_asked));
+}
