@@ -43,6 +43,8 @@ const LOGS_KEPT: usize = 50;
 pub struct Config {
     /// Shared between daemons: layers, downloaded packages, lists.
     pub cache_dir: PathBuf,
+    /// Bytes of layers and packages in it; beyond them those are removed that were not used for longest.
+    pub cache_bytes: u64,
     /// Base definitions.
     pub bases_dir: PathBuf,
     /// Half-made things, one directory per build; swept by whoever starts the daemon.
@@ -133,6 +135,11 @@ impl Builder {
         blocking::cancellable(self.make(request, events)).await
     }
 
+    /// Where layers and packages are kept.
+    pub fn cache_dir(&self) -> &Path {
+        &self.config.cache_dir
+    }
+
     /// Returns when the containers of a build have ended and its directory is removed.
     pub async fn removed(&self, id: &str) {
         self.removals.done(id).await;
@@ -188,8 +195,9 @@ impl Builder {
             progress.clone(),
         );
         let archive = self.archive(&shop, &base, progress).await?;
-        if let What::Tree(pushed) = &what {
-            early(&archive, &base, request, pushed)?;
+        match &what {
+            What::Tree(pushed) => early(&archive, &base, request, pushed)?,
+            What::Packaged(_) => drop(keys::mapped(&archive, &base, &request.map)?),
         }
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
         let base_layer = wheels::on_base(&shop, &base, base_layer, progress).await?;
@@ -205,7 +213,8 @@ impl Builder {
         };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
-        blocking::spawn(move || unused::sweep(&cache)).await?;
+        let swept = cache.clone();
+        blocking::spawn(move || unused::sweep(&swept)).await?;
         let work = async {
             let made = match what {
                 What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
@@ -217,6 +226,9 @@ impl Builder {
         let outcome = work.await;
         // What was installed and compiled before something failed is not lost: the next push begins there.
         let settled = build.shop.settled().await;
+        // A failed build leaves as much in the cache.
+        let most = self.config.cache_bytes;
+        blocking::spawn(move || unused::shrink(&cache, most)).await?;
         let outcome = outcome?;
         settled?;
         Ok(outcome)
@@ -379,7 +391,74 @@ fn sweep_logs(directory: &Path) {
 
 #[cfg(test)]
 mod tests {
+    use async_trait::async_trait;
+    use servant::container::ContainerSpec;
+    use servant::sandbox::Sandboxed;
+
     use super::*;
+
+    /// No container is to be started.
+    struct Unasked;
+
+    #[async_trait]
+    impl Sandbox for Unasked {
+        async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, servant::Error> {
+            panic!("container {} is started", spec.id)
+        }
+    }
+
+    #[tokio::test]
+    async fn what_is_no_package_is_refused_before_anything_is_made_for_it() {
+        let place = tempfile::tempdir().expect("a directory");
+        let at = |name: &str| place.path().join(name);
+        let store = Store::open(&at("images"), &at("layers")).expect("a store");
+        let builder = Builder::new(Config {
+            cache_dir: at("cache"),
+            cache_bytes: u64::MAX,
+            bases_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"),
+            build_dir: at("build"),
+            logs_dir: at("logs"),
+            sources: Sources::default(),
+            store: Arc::new(store),
+            sandbox: Arc::new(Unasked),
+            limits: Limits::default(),
+        })
+        .expect("prepared");
+        let trees = [
+            &[][..],
+            &["README", "notes/todo.txt"],
+            &["src/node.py", "launch/it.launch"],
+            &["install/setup.sh", "install/.catkin"],
+            &["setup.sh", ".catkin", "lib/p/node"],
+        ];
+        for (number, files) in trees.iter().enumerate() {
+            for base in [None, Some(DEFAULT_BASE), Some("noble-jazzy")] {
+                let tree = at(&format!("pushed-{number}-{}", base.unwrap_or("any")));
+                for file in *files {
+                    let file = tree.join(file);
+                    fs::create_dir_all(file.parent().expect("one")).expect("made");
+                    fs::write(file, "").expect("written");
+                }
+                fs::create_dir_all(&tree).expect("made");
+                let request = PushRequest {
+                    id: "p1".to_owned(),
+                    source: Source::Tree(tree),
+                    base: base.map(str::to_owned),
+                    ..PushRequest::default()
+                };
+                let (sender, mut events) = mpsc::channel(100);
+                let refused = builder
+                    .build(&request, sender)
+                    .await
+                    .expect_err("no package");
+                let text = refused.to_string();
+                assert!(text.contains("package.xml"), "{files:?} {base:?}: {text}");
+                assert_eq!(events.recv().await, None, "nothing is begun");
+                let made = fs::read_dir(at("build")).expect("listed").count();
+                assert_eq!(made, 0, "{files:?} {base:?}");
+            }
+        }
+    }
 
     #[test]
     fn only_the_newest_logs_are_kept() {

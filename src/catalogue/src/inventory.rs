@@ -135,7 +135,7 @@ pub(crate) fn digest(image: &str) -> Result<image::Digest, Error> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use std::collections::BTreeMap;
     use std::os::unix::fs::PermissionsExt;
     use std::path::Path;
@@ -154,7 +154,7 @@ mod tests {
     }
 
     /// A catalogue with the image of a package, and a revision of it that is not published yet.
-    fn catalogue(place: &Path) -> (Catalogue, RevisionRecord) {
+    pub(crate) fn catalogue(place: &Path) -> (Catalogue, RevisionRecord) {
         let tree = place.join("tree");
         write(&tree, "usr/share/p/package.xml", "<package/>", 0o644);
         write(&tree, "usr/share/p/msg/Said.msg", "string words\n", 0o644);

@@ -14,6 +14,7 @@ mod error;
 mod fit;
 mod inventory;
 pub mod names;
+mod owned;
 mod publish;
 pub mod stubs;
 

@@ -144,6 +144,7 @@ fn builder(
         .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
     Builder::new(rootfs_builder::Config {
         cache_dir: cache,
+        cache_bytes: config.push.cache.0,
         bases_dir,
         build_dir: home.path().join("build"),
         logs_dir: home.path().join("logs"),

@@ -15,8 +15,8 @@ use nix::sys::statvfs::statvfs;
 use rootfs_builder::blocking;
 use tokio::time::{Instant, MissedTickBehavior};
 
-use crate::Error;
-use crate::Options;
+use crate::room::Disks;
+use crate::{Error, Options};
 
 /// How often it is looked whether the file system fills.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
@@ -29,15 +29,17 @@ const LEAST: u64 = 4 << 10;
 pub(super) struct Left<'a> {
     options: &'a Options,
     directory: PathBuf,
+    disks: &'a Disks,
     time: Duration,
 }
 
-impl Left<'_> {
+impl<'a> Left<'a> {
     /// Of a push that works in `directory`.
-    pub(super) fn new(options: &Options, directory: PathBuf) -> Left<'_> {
+    pub(super) fn new(options: &'a Options, directory: PathBuf, disks: &'a Disks) -> Left<'a> {
         Left {
             options,
             directory,
+            disks,
             time: options.time,
         }
     }
@@ -51,6 +53,7 @@ impl Left<'_> {
         let outcome = tokio::select! {
             outcome = work => outcome,
             error = exceeded(self.options, self.time, &self.directory) => Err(error),
+            error = self.disks.low() => Err(error),
         };
         self.time = self.time.saturating_sub(began.elapsed());
         outcome

@@ -23,6 +23,7 @@ mod probe;
 mod publish;
 mod receive;
 mod request;
+mod room;
 mod shared;
 mod stateful;
 mod supplement;
@@ -47,6 +48,7 @@ use bounds::Left;
 use exported::Imported;
 use places::Places;
 use request::Reporter;
+use room::Disks;
 use store::{Journal, NewEvent, Plan, RevisionRecord};
 
 pub use error::Error;
@@ -89,6 +91,7 @@ pub struct Pusher {
     builder: Arc<Builder>,
     journal: Journal,
     places: Places,
+    disks: Disks,
     published: AtomicU64,
     failed: AtomicU64,
     cancel: CancellationToken,
@@ -108,6 +111,7 @@ impl Pusher {
         } = parts;
         Pusher {
             places: Places::new(&options),
+            disks: Disks::new(&home, builder.cache_dir(), options.free),
             options,
             home,
             journal,
@@ -156,7 +160,10 @@ impl Pusher {
         let began = Instant::now();
         let known = options.name.as_deref().or(options.apt.as_deref());
         let mut admitted = self.places.enter(known, report).await?;
-        let mut left = Left::new(&self.options, self.home.join("build").join(id));
+        self.disks.check().await?;
+        self.check_quota(by.owner.as_deref(), None).await?;
+        let build = self.home.join("build").join(id);
+        let mut left = Left::new(&self.options, build, &self.disks);
         let made = left
             .during(self.made(id, options, archive, (by, report)))
             .await?;
@@ -182,6 +189,8 @@ impl Pusher {
         admitted.named(&name, report).await?;
         // Pushes of one service follow one another: whose it is does not change until this one is done.
         by.may(&name)?;
+        let image = built.image.to_string();
+        self.check_quota(by.owner.as_deref(), Some(&image)).await?;
         let mut plan = plan_of(&built, options);
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;

@@ -25,6 +25,10 @@ pub struct Options {
     pub time: Duration,
     /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
     pub disk: Size,
+    /// Bytes that stay free on the disks that pushes write to, though no more than a twentieth of a disk.
+    pub free: Size,
+    /// Bytes of the images of all services of one deployer; 0 for any.
+    pub per_deployer: Size,
 }
 
 #[cfg(test)]
@@ -42,6 +46,8 @@ impl Options {
             queue: 16,
             time: Duration::from_secs(7200),
             disk: Size(20 << 30),
+            free: Size(0),
+            per_deployer: Size(0),
         }
     }
 }

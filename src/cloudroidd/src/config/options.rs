@@ -65,6 +65,8 @@ impl Config {
             queue: push.queue,
             time: push.time.0,
             disk: push.disk,
+            free: push.free,
+            per_deployer: push.per_deployer,
         }
     }
 

@@ -31,6 +31,12 @@ pub struct Push {
     pub time: Time,
     /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
     pub disk: Size,
+    /// Bytes that stay free on the disks that pushes write to, though no more than a twentieth of a disk.
+    pub free: Size,
+    /// Bytes of the images of all services of one deployer; 0 for any.
+    pub per_deployer: Size,
+    /// Bytes of layers and packages in the cache of builds.
+    pub cache: Size,
     /// Cores of each container of a build; as many as servants leave when not set.
     pub cpus: Option<f64>,
     /// Memory of each; half of the machine's when not set.
@@ -52,6 +58,9 @@ impl Default for Push {
             queue: 16,
             time: Time::seconds(2 * 3600),
             disk: Size(20 << 30),
+            free: Size(2 << 30),
+            per_deployer: Size(50 << 30),
+            cache: Size(30 << 30),
             cpus: None,
             memory: None,
             pids: 4096,
