@@ -214,7 +214,7 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     );
     let typed = ["--server", &server, "--token", &admin, "import", &hers];
     types(&typed)?.failed_saying(&["was not exported from a service"])?;
-    is_pulled_with_a_token(&other.address.to_string(), &eve, &at("pulled"))?;
+    is_pulled_with_a_token(&other.address, &eve, &at("pulled"))?;
     other.ends()?;
     Ok(())
 }
@@ -231,7 +231,10 @@ fn is_pulled_with_a_token(address: &str, token: &str, to: &str) -> Verdict {
     for words in [&["--src-no-creds"][..], &["--src-creds", "cluster:guessed"]] {
         let refused = pulls(words)?;
         let said = refused.said().to_lowercase();
-        ensure!(refused.status != 0 && said.contains("auth"), "{words:?}: {said}");
+        ensure!(
+            refused.status != 0 && said.contains("auth"),
+            "{words:?}: {said}"
+        );
     }
     Ok(())
 }

@@ -172,7 +172,16 @@ pub fn base() -> anyhow::Result<PathBuf> {
     );
     // What mmdebstrap mounts is seen by nobody else, and gone when it is killed.
     let made = run(Command::new("unshare")
-        .args(["--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc", "mmdebstrap"])
+        .args([
+            "--mount",
+            "--propagation",
+            "private",
+            "--pid",
+            "--fork",
+            "--kill-child",
+            "--mount-proc",
+            "mmdebstrap",
+        ])
         .args(["--quiet", "--mode=root", "--variant=minbase"])
         .arg(format!("--include={}", PACKAGES.join(",")))
         .arg("--aptopt=APT::Install-Recommends \"false\"")
