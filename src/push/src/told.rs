@@ -1,0 +1,143 @@
+//! What a deployer is told of a build, in words that mean something to whoever pushed.
+
+use std::path::Path;
+
+use api::PushEvent;
+use rootfs_builder::BuildEvent;
+
+use super::{Deployer, Error, PUSHED};
+
+/// What a deployer is told of a build. Of others' services it hears nothing but where it may publish them itself.
+pub(super) fn event(event: BuildEvent, by: &Deployer) -> PushEvent {
+    match event {
+        BuildEvent::Waits { push } => {
+            let whose = match by.may(&push) {
+                Ok(()) => format!("the push of {push}"),
+                Err(_) => "another push".to_owned(),
+            };
+            PushEvent::Step {
+                title: format!("waiting: {whose} makes a layer that this one needs, too"),
+            }
+        }
+        BuildEvent::Step { title } => PushEvent::Step { title },
+        BuildEvent::Log { line } => PushEvent::Log { line },
+        BuildEvent::Progress { unit, done, total } => PushEvent::Progress {
+            unit: unit.to_owned(),
+            done,
+            total,
+        },
+        BuildEvent::Warning { message } => PushEvent::Warning { message },
+    }
+}
+
+/// Why a build failed. `home`: the daemon's; `source`: what was pushed, as the pusher named it.
+pub(super) fn error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error {
+    let mut next = None;
+    let (message, log) = match error {
+        // The complete log has been sent line by line.
+        rootfs_builder::Error::BuildFailed {
+            package,
+            last_lines,
+            advice,
+            ..
+        } => {
+            next = (!advice.is_empty()).then(|| advice.join("; "));
+            let lines = last_lines.lines().map(str::to_owned).collect();
+            (format!("the build of {package} failed"), lines)
+        }
+        error => (
+            as_the_pusher_knows_it(&error.to_string(), home, source),
+            Vec::new(),
+        ),
+    };
+    Error::Failed { message, next, log }
+}
+
+/// Names what was pushed as the pusher did (`source`), and leaves out where the build is: that means nothing to him.
+fn as_the_pusher_knows_it(text: &str, home: &Path, source: &str) -> String {
+    let builds = format!("{}/", home.join("build").display());
+    let mut parts = text.split(builds.as_str());
+    let mut named = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let inside = part.split_once('/').map_or(part, |(_, inside)| inside);
+        match inside.strip_prefix(PUSHED) {
+            Some(below) if source.is_empty() => named.push_str(below.trim_start_matches('/')),
+            Some(below) => {
+                named.push_str(source.trim_end_matches('/'));
+                named.push_str(below);
+            }
+            None => named.push_str(inside),
+        }
+    }
+    named
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_of_the_build_are_told_as_the_pusher_knows_them() {
+        let told =
+            |text: &str, source: &str| as_the_pusher_knows_it(text, Path::new("/home"), source);
+        let text = "/home/build/push-1/pushed/src/a/package.xml, line 4: malformed; see /home/build/push-1/log";
+        assert_eq!(
+            told(text, "../torn/"),
+            "../torn/src/a/package.xml, line 4: malformed; see log"
+        );
+        assert_eq!(
+            told("there is no package.xml in /home/build/push-1/pushed", "."),
+            "there is no package.xml in ."
+        );
+        assert_eq!(told("nothing to fix", "x"), "nothing to fix");
+    }
+
+    #[test]
+    fn whoever_waits_is_told_for_whom_where_that_may_be_known() {
+        let by = Deployer {
+            owner: None,
+            may: Box::new(|name| {
+                if name.starts_with("lab_") {
+                    Ok(())
+                } else {
+                    Err("not yours".to_owned())
+                }
+            }),
+            over: Box::new(|| Box::pin(std::future::pending())),
+        };
+        for (push, whose) in [
+            ("lab_maps", "the push of lab_maps"),
+            ("field", "another push"),
+        ] {
+            let event = BuildEvent::Waits { push: push.into() };
+            let PushEvent::Step { title } = super::event(event, &by) else {
+                panic!("a step");
+            };
+            let expected = format!("waiting: {whose} makes a layer that this one needs, too");
+            assert_eq!(title, expected);
+        }
+    }
+
+    #[test]
+    fn a_failed_build_is_told_with_the_compilers_words() {
+        let failed = rootfs_builder::Error::BuildFailed {
+            package: "broken".into(),
+            log: "/home/build/push-1/log".into(),
+            last_lines: "main.cpp:3: error: expected ;\nmake: *** [all] Error 2".into(),
+            advice: vec![
+                "the CMake package warp is missing: push with `--with libwarp-dev`".into(),
+            ],
+        };
+        let Error::Failed { message, next, log } = error(&failed, Path::new("/home"), "broken")
+        else {
+            panic!("it failed");
+        };
+        assert_eq!(message, "the build of broken failed");
+        assert_eq!(
+            log,
+            ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]
+        );
+        let next = next.expect("what to do");
+        assert!(next.contains("`--with libwarp-dev`"), "{next}");
+    }
+}
