@@ -165,6 +165,7 @@ pub fn doctor_names_each_need() -> Verdict {
         "idmap",
         "user namespace",
         "seccomp",
+        "landlock",
         "cgroup",
         "mmdebstrap",
         "cloudroid-init",

@@ -82,6 +82,7 @@ fn main() -> ExitCode {
         stories![restarts:
             a_killed_daemon_is_started_again_and_finds_its_servants,
             a_restart_loses_nothing,
+            after_a_restart_of_the_unit_no_two_servants_have_the_same_user_ids,
         ],
     ]
     .into_iter()

@@ -25,6 +25,7 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
         user_namespaces(),
         idmapped_mounts(home),
         seccomp(),
+        landlock(),
     ];
     checks.push(cgroups::check());
     checks.push(program("mmdebstrap", "mmdebstrap", "makes base images"));
@@ -215,6 +216,20 @@ fn seccomp() -> Check {
             "boot a kernel with CONFIG_SECCOMP_FILTER, such as the distribution's own",
         ),
     }
+}
+
+fn landlock() -> Check {
+    if servant::shim::can_keep_to_files() {
+        return ok(
+            "landlock",
+            "the ROS Masters of servants are kept to their own files",
+        );
+    }
+    warning(
+        "landlock",
+        "the kernel cannot keep the ROS Masters of servants to their own files",
+        "boot with landlock among lsm=, such as lsm=landlock,lockdown,yama,integrity,apparmor",
+    )
 }
 
 fn idmapped_mounts(home: &Path) -> Check {

@@ -1,13 +1,14 @@
 //! The OCI runtime configuration of a servant.
 
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 
+use nix::sys::resource::{Resource, getrlimit};
 use oci_spec::OciSpecError;
 use oci_spec::runtime::{
-    Capability, LinuxBuilder, LinuxCapabilitiesBuilder, LinuxIdMappingBuilder,
-    LinuxNamespaceBuilder, LinuxNamespaceType, Mount, MountBuilder, PosixRlimit,
-    PosixRlimitBuilder, PosixRlimitType, Process, ProcessBuilder, RootBuilder, Spec as OciSpec,
-    SpecBuilder, UserBuilder,
+    Capability, LinuxBuilder, LinuxCapabilitiesBuilder, LinuxNamespaceBuilder, LinuxNamespaceType,
+    Mount, MountBuilder, PosixRlimit, PosixRlimitBuilder, PosixRlimitType, Process, ProcessBuilder,
+    RootBuilder, Spec as OciSpec, SpecBuilder, UserBuilder,
 };
 
 use crate::container::{ContainerSpec, Profile};
@@ -17,6 +18,18 @@ use crate::seccomp;
 
 /// Open files of one process; more only slows down programs that close every number they might have open.
 const OPEN_FILES: u64 = 16_384;
+
+/// Signals that wait for processes of one user of a container; each of its timers counts as one, too.
+pub const PENDING_SIGNALS: u64 = 4096;
+
+/// Bytes of POSIX message queues of one user of a container: what the kernel gives a user by default.
+pub const MESSAGE_QUEUES: u64 = 819_200;
+
+/// Instances of inotify of one user of a container: what the kernel gives a user by default.
+pub const INOTIFY_INSTANCES: u64 = 128;
+
+/// Pseudoterminals of one container; the host has some thousands for all.
+pub const TERMINALS: u64 = 64;
 
 const MASKED: [&str; 9] = [
     "/proc/acpi",
@@ -40,20 +53,21 @@ const READ_ONLY: [&str; 5] = [
 
 /// The configuration of the container whose root and volumes are staged. There is no network namespace in it: the creating
 /// process is in the servant's already and the container inherits it. Limits are not in it either: the cgroup is
-/// made, set and read back before.
+/// made, set and read back before. The user namespace is there already, too (see [`crate::idmap::user_namespace`]).
 pub fn config(
     spec: &ContainerSpec,
     staged: &Staged,
-    uid: (u32, u32),
     quotas: &Quotas,
 ) -> Result<OciSpec, OciSpecError> {
-    let mapping = LinuxIdMappingBuilder::default()
-        .container_id(0_u32)
-        .host_id(uid.0)
-        .size(uid.1)
+    let user = LinuxNamespaceBuilder::default()
+        .typ(LinuxNamespaceType::User)
+        // Open in the process that makes the container, and in those that it forks for that.
+        .path(format!(
+            "/proc/self/fd/{}",
+            staged.user_namespace.as_raw_fd()
+        ))
         .build()?;
-    let namespaces = [
-        LinuxNamespaceType::User,
+    let others = [
         LinuxNamespaceType::Mount,
         LinuxNamespaceType::Pid,
         LinuxNamespaceType::Ipc,
@@ -61,12 +75,18 @@ pub fn config(
         LinuxNamespaceType::Cgroup,
     ]
     .into_iter()
-    .map(|kind| LinuxNamespaceBuilder::default().typ(kind).build())
-    .collect::<Result<Vec<_>, _>>()?;
+    .map(|kind| LinuxNamespaceBuilder::default().typ(kind).build());
+    let namespaces = std::iter::once(Ok(user))
+        .chain(others)
+        .collect::<Result<Vec<_>, _>>()?;
     let mut linux = LinuxBuilder::default()
         .namespaces(namespaces)
-        .uid_mappings(vec![mapping])
-        .gid_mappings(vec![mapping])
+        // Written by whoever makes the container, who may in its user namespace. Where the host allows each user more, a
+        // container has no more for that.
+        .sysctl(std::collections::HashMap::from([(
+            "user.max_inotify_instances".to_owned(),
+            INOTIFY_INSTANCES.to_string(),
+        )]))
         // libcontainer sees no cgroups at all (see rootfs.rs). If ever it did, it must not find anybody here: with an
         // empty path its cleanup would kill every process of the cgroups that its caller is in, up to the host's.
         .cgroups_path(Path::new("/cloudroid-unused").join(&spec.id))
@@ -143,19 +163,33 @@ fn process(spec: &ContainerSpec) -> Result<Process, OciSpecError> {
         .no_new_privileges(true)
         .oom_score_adj(oom_score(spec.profile))
         .rlimits(vec![
-            rlimit(PosixRlimitType::RlimitNofile, OPEN_FILES)?,
-            rlimit(PosixRlimitType::RlimitCore, 0)?,
+            rlimit(
+                PosixRlimitType::RlimitNofile,
+                Resource::RLIMIT_NOFILE,
+                OPEN_FILES,
+            )?,
+            rlimit(PosixRlimitType::RlimitCore, Resource::RLIMIT_CORE, 0)?,
+            rlimit(
+                PosixRlimitType::RlimitSigpending,
+                Resource::RLIMIT_SIGPENDING,
+                PENDING_SIGNALS,
+            )?,
+            rlimit(
+                PosixRlimitType::RlimitMsgqueue,
+                Resource::RLIMIT_MSGQUEUE,
+                MESSAGE_QUEUES,
+            )?,
         ])
         .build()
 }
 
 /// At most `wanted`, never more than we have: raising a hard limit takes a capability that we may lack.
-fn rlimit(kind: PosixRlimitType, wanted: u64) -> Result<PosixRlimit, OciSpecError> {
-    let resource = match kind {
-        PosixRlimitType::RlimitNofile => nix::sys::resource::Resource::RLIMIT_NOFILE,
-        _ => nix::sys::resource::Resource::RLIMIT_CORE,
-    };
-    let hard = nix::sys::resource::getrlimit(resource).map_or(wanted, |(_, hard)| hard.min(wanted));
+fn rlimit(
+    kind: PosixRlimitType,
+    resource: Resource,
+    wanted: u64,
+) -> Result<PosixRlimit, OciSpecError> {
+    let hard = getrlimit(resource).map_or(wanted, |(_, hard)| hard.min(wanted));
     PosixRlimitBuilder::default()
         .typ(kind)
         .soft(hard)
@@ -219,6 +253,7 @@ fn mounts(
                 "ptmxmode=0666",
                 "mode=0620",
                 "gid=5",
+                &format!("max={TERMINALS}"),
             ]),
         )?,
         tmpfs("/dev/shm", "1777", scratch, &["noexec"])?,
@@ -289,8 +324,8 @@ mod tests {
                 &Staged {
                     root: "/r".into(),
                     volumes: vec![],
+                    user_namespace: std::fs::File::open("/proc/self/ns/user").unwrap().into(),
                 },
-                (5, 65536),
                 &Quotas::default(),
             )
             .unwrap(),
@@ -322,7 +357,8 @@ mod tests {
         );
         for config in [servant, compile, install] {
             assert_eq!(config["process"]["noNewPrivileges"], true);
-            assert_eq!(config["linux"]["uidMappings"][0]["hostID"], 5);
+            assert_eq!(config["linux"]["namespaces"][0]["type"], "user");
+            assert!(config["linux"]["namespaces"][0]["path"].is_string());
         }
     }
 

@@ -34,6 +34,7 @@ mod v2;
 
 use files::{read_number, read_pids};
 pub use hosts::Parent;
+pub use v1::counts_sockets;
 
 /// The directories of one servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -257,6 +258,11 @@ impl Cgroup {
                 reason,
             })
         })
+    }
+
+    /// Its directories, one in each hierarchy in use.
+    pub(crate) fn directories(&self) -> impl Iterator<Item = &Path> {
+        self.leaves.iter().map(|leaf| leaf.directory.as_path())
     }
 
     /// Whether any of its directories is there.

@@ -1,4 +1,5 @@
-//! Mounts with shifted user ids: a user namespace that nobody lives in gives its map to them.
+//! User namespaces: the one that a container lives in, whose map its layers have; and one that nobody lives in, to try out
+//! whether mounts can be shifted.
 
 use std::fs::{self, File};
 use std::io;
@@ -7,7 +8,14 @@ use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use crate::{Error, sys};
+use caps::CapSet;
+use nix::errno::Errno;
+use nix::sched::{CloneFlags, unshare};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use nix::sys::wait::waitpid;
+use nix::unistd::{ForkResult, Uid, setresuid};
+
+use crate::{Error, bundle, sys};
 
 /// Tries it on the file system that holds `directory`: a detached copy of the mount is made, shifted, and dropped. Nobody
 /// sees it.
@@ -34,8 +42,62 @@ pub(crate) fn map(pid: i32, (first, count): (u32, u32)) -> Result<OwnedFd, Error
         .into())
 }
 
+/// Makes the user namespace of a container, whose root is the first id of `range`. The calling process must have one thread.
+///
+/// What the kernel counts by user (instances of inotify, signals that wait, message queues, locked memory, processes) it counts
+/// for the user inside and, with that, for whoever made the namespace. Made by root, each container would use up root's
+/// counts of the whole host; so the maker is the first user of the range, who has nothing else. How much all users inside
+/// may have together is what the maker may have.
+pub(crate) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
+    let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
+    let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
+    // SAFETY: the calling process has one thread; the child makes system calls only.
+    match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork"))? {
+        ForkResult::Child => {
+            drop(release);
+            let errno = unshare_as(range.0).err().map_or(0, |errno| errno as i32);
+            let _ = nix::unistd::write(&tell, &errno.to_ne_bytes());
+            let _ = nix::unistd::read(&wait, &mut [0]);
+            // SAFETY: ends the child without running what the parent has registered for its own end.
+            unsafe { libc::_exit(0) }
+        }
+        ForkResult::Parent { child } => {
+            drop(tell);
+            let mut errno = [0; 4];
+            let read = nix::unistd::read(&unshared, &mut errno);
+            let made = match (read, i32::from_ne_bytes(errno)) {
+                (Ok(4), 0) => map(child.as_raw(), range),
+                (_, errno) => Err(Error::call("unshare of a user namespace")(
+                    io::Error::from_raw_os_error(errno),
+                )),
+            };
+            drop(release);
+            let _ = waitpid(child, None);
+            made
+        }
+    }
+}
+
+/// Moves the calling process to a user namespace that `user` has made.
+fn unshare_as(user: u32) -> nix::Result<()> {
+    for (resource, most) in [
+        (Resource::RLIMIT_SIGPENDING, bundle::PENDING_SIGNALS),
+        (Resource::RLIMIT_MSGQUEUE, bundle::MESSAGE_QUEUES),
+    ] {
+        let most = getrlimit(resource)?.1.min(most);
+        setrlimit(resource, most, most)?;
+    }
+    // Another user has no effective capability, but may take back those that are permitted. Where hosts let root alone make
+    // user namespaces, it takes one.
+    let user = Uid::from_raw(user);
+    let held = caps::read(None, CapSet::Permitted).map_err(|_| Errno::EPERM)?;
+    setresuid(Uid::from_raw(0), user, Uid::from_raw(0))?;
+    caps::set(None, CapSet::Effective, &held).map_err(|_| Errno::EPERM)?;
+    unshare(CloneFlags::CLONE_NEWUSER)
+}
+
 /// A process in a user namespace of its own, which waits to be ended. For programs of several threads: where there is one
-/// thread, a fork is enough (see `rootfs::stage`).
+/// thread, a fork is enough (see [`user_namespace`]).
 struct Holder(Child);
 
 impl Holder {
@@ -47,9 +109,7 @@ impl Holder {
             .stderr(Stdio::null());
         // SAFETY: unshare is safe to call between fork and exec.
         unsafe {
-            command.pre_exec(|| {
-                nix::sched::unshare(nix::sched::CloneFlags::CLONE_NEWUSER).map_err(io::Error::from)
-            });
+            command.pre_exec(|| unshare(CloneFlags::CLONE_NEWUSER).map_err(io::Error::from));
         }
         command.spawn().map(Self)
     }

@@ -21,6 +21,7 @@ pub use crate::launch::{Grace, Isolation};
 use crate::logs::Watches;
 use crate::quotas::Quotas;
 use crate::spec::{Limits, Spec};
+use crate::uids;
 
 mod connection;
 pub mod grants;
@@ -87,6 +88,8 @@ pub struct LocalEngineConfig {
     pub quotas: Quotas,
     /// First uid of the first range; see [`DEFAULT_UID_BASE`].
     pub uid_base: u32,
+    /// By whose locks all engines of the host know which ranges are taken.
+    pub uid_locks: PathBuf,
     /// Whether less isolation than asked for is accepted.
     pub isolation: Isolation,
     /// How long nodes have to end when the servant is stopped.
@@ -115,6 +118,7 @@ impl LocalEngineConfig {
             },
             quotas: Quotas::default(),
             uid_base: DEFAULT_UID_BASE,
+            uid_locks: uids::LOCKS.into(),
             isolation: Isolation::Require,
             grace: Grace::default(),
             allow: grants::Allow::default(),

@@ -15,7 +15,7 @@ use nix::mount::{MsFlags, mount};
 use nix::unistd::{Gid, Uid};
 
 use crate::container::Mount;
-use crate::{Error, sys};
+use crate::{Error, idmap, sys};
 
 mod skeleton;
 mod stage;
@@ -45,6 +45,8 @@ pub struct Staged {
     pub root: PathBuf,
     /// The sources of the extra mounts, in their order.
     pub volumes: Vec<PathBuf>,
+    /// The user namespace whose map the layers have, for the container to live in.
+    pub user_namespace: OwnedFd,
 }
 
 impl Rootfs<'_> {
@@ -57,7 +59,7 @@ impl Rootfs<'_> {
             .map(stage::copy_volume)
             .collect::<Result<Vec<_>, _>>()?;
         let stage = stage::enter()?;
-        let shift = stage::user_namespace(self.uid_range)?;
+        let shift = idmap::user_namespace(self.uid_range)?;
         let (lower, root) = (stage.join("lower"), stage.join("root"));
         for path in [&lower, &root] {
             make_directory(path)?;
@@ -99,9 +101,11 @@ impl Rootfs<'_> {
             let place = stage.join(format!("volume{index}"));
             stage::attach_volume(volume, copy, &place, &shift).map(|()| place)
         });
+        let volumes = volumes.collect::<Result<_, _>>()?;
         Ok(Staged {
-            volumes: volumes.collect::<Result<_, _>>()?,
+            volumes,
             root,
+            user_namespace: shift,
         })
     }
 

@@ -12,7 +12,8 @@ use oci_spec::runtime::{
 
 use crate::container::Profile;
 
-/// Allowed whatever their arguments.
+/// Allowed whatever their arguments. Not among them: `io_setup` and its like, since the requests that may wait are counted for
+/// the whole host (`fs.aio-max-nr`), which one servant could use up. Programs that find no such call do without.
 const ALLOWED: &[&str] = &[
     // files
     "access chdir chmod chown close close_range copy_file_range creat dup dup2 dup3 faccessat faccessat2 fadvise64 \
@@ -25,8 +26,7 @@ const ALLOWED: &[&str] = &[
      writev",
     // waiting
     "epoll_create epoll_create1 epoll_ctl epoll_pwait epoll_pwait2 epoll_wait eventfd eventfd2 inotify_add_watch \
-     inotify_init inotify_init1 inotify_rm_watch io_cancel io_destroy io_getevents io_pgetevents io_setup io_submit \
-     poll ppoll pselect6 select",
+     inotify_init inotify_init1 inotify_rm_watch poll ppoll pselect6 select",
     // memory
     "brk cachestat get_mempolicy madvise map_shadow_stack membarrier memfd_create mincore mlock mlock2 mlockall mmap \
      mprotect mremap mseal msync munlock munlockall munmap pkey_alloc pkey_free pkey_mprotect remap_file_pages",
@@ -47,7 +47,7 @@ const ALLOWED: &[&str] = &[
     // talking to one another
     "accept accept4 bind connect getpeername getsockname getsockopt listen mq_getsetattr mq_notify mq_open \
      mq_timedreceive mq_timedsend mq_unlink msgctl msgget msgrcv msgsnd pipe pipe2 recvfrom recvmmsg recvmsg semctl \
-     semget semop semtimedop sendmmsg sendmsg sendto setsockopt shmat shmctl shmdt shmget shutdown socketpair",
+     semget semop semtimedop sendmmsg sendmsg sendto setsockopt shmat shmctl shmdt shmget shutdown",
     // other
     "getrandom",
 ];
@@ -74,6 +74,9 @@ const CLONE_NEW: u64 = 0x7E02_0000;
 /// Socket families: unix, IPv4, IPv6, netlink. Not vsock, which no network namespace confines.
 const FAMILIES: [u64; 4] = [1, 2, 10, 16];
 
+/// Families of pairs: unix. The kernel has others, whose modules it would load for the asking.
+const PAIRED: [u64; 1] = [1];
+
 /// Execution domains: Linux, 32-bit addresses' limit, no address randomisation, both, and the question which it is.
 const PERSONALITIES: [u64; 5] = [0x0, 0x8, 0x2_0000, 0x2_0008, 0xffff_ffff];
 
@@ -85,6 +88,11 @@ fn names(groups: &[&'static str]) -> Vec<&'static str> {
         .iter()
         .flat_map(|group| group.split_whitespace())
         .collect()
+}
+
+/// Calls that are refused to all that runs for strangers.
+pub(crate) fn refused() -> impl Iterator<Item = &'static str> {
+    names(REFUSED).into_iter()
 }
 
 /// The profile as part of an OCI specification.
@@ -119,6 +127,7 @@ pub fn profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
     ];
     for (name, values) in [
         ("socket", FAMILIES.as_slice()),
+        ("socketpair", &PAIRED),
         ("personality", &PERSONALITIES),
     ] {
         for value in values {

@@ -5,14 +5,16 @@
 //! ```text
 //!   begin    one thread: session, standard streams, launch record, cgroup with limits read back, network namespace
 //!     |      fork -> creator: layers, overlay, libcontainer; it exits and takes all their memory with it
-//!   drive    one thread, one event loop; all privileges but CAP_KILL are gone
+//!   drive    one thread, one event loop; all privileges but CAP_KILL are gone,
+//!     |      and all files but the servant's
 //!     |      Creating -> Running -> (stop asked, required node ended, init gone) -> Stopped | Failed
 //!   end      pid namespace killed, log drained, cgroup removed, exit.json written, connections told
 //! ```
 //!
 //! What is kept after the container runs: uid 0 without capabilities, except CAP_KILL, because init has another uid and
 //! must die when asked. The cgroup's files and the servant's directory belong to root, so that limits are changed,
-//! the log written and the cgroup removed without further rights. No new privileges can be gained.
+//! the log written and the cgroup removed without further rights. No other files can be opened, no programs executed, and no
+//! new privileges gained.
 //!
 //! Directories are not removed by the shim but by the engine ([`crate::engine::Servant::stop`] and
 //! [`crate::engine::Engine::adopt`]): the log and `exit.json` are still to be read.
@@ -59,6 +61,11 @@ pub trait Resident {
 
     /// A process of the servant has ended (node, child or orphan); `pid` as seen inside.
     fn process_exited(&mut self, pid: i32);
+}
+
+/// Whether the kernel can keep shims to their servants' files (Landlock). Where it cannot, they could open what belongs to root.
+pub fn can_keep_to_files() -> bool {
+    privileges::can_keep_to_files()
 }
 
 /// Is the shim of the servant whose state directory this is. To be called by the command that

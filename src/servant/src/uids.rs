@@ -1,13 +1,17 @@
 //! Each servant has 65536 user ids that nothing else on the host uses. A range is taken by locking one byte of a file
 //! that all engines of the host share; the lock is held by the shim and ends with it, however that ends.
+//!
+//! A file that was removed keeps the locks of those who have it open, and its successor knows nothing of them: so an engine looks
+//! at what its servants' records say, too.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
-use crate::{Error, sys};
+use crate::{Error, launch, sys};
 
 /// Ids in a range.
 pub const RANGE: u32 = 65536;
@@ -15,11 +19,12 @@ pub const RANGE: u32 = 65536;
 /// Uids that Linux leaves alone end below this one (systemd, docs/UIDS-GIDS.md).
 const END: u32 = 0x7ffe_0000;
 
-const FILE: &str = "/run/cloudroid/uid-ranges";
+/// The file that all engines of the host share.
+pub const LOCKS: &str = "/run/cloudroid/uid-ranges";
 
-/// Takes a free range from `base` on: its first uid, and the lock to keep.
-pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
-    let path = Path::new(FILE);
+/// Takes a free range from `base` on, by a lock in the file `path`: its first uid, and the lock to keep. Those whose first uid is
+/// among `held` are passed over, whatever their locks.
+pub fn take(path: &Path, base: u32, held: &BTreeSet<u32>) -> Result<(u32, OwnedFd), Error> {
     let directory = path.parent().unwrap_or(path);
     fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
     let file: OwnedFd = open(path).map_err(Error::file("open", path))?.into();
@@ -29,7 +34,7 @@ pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
     } else {
         u32::MAX / RANGE
     };
-    for range in first..end {
+    for range in (first..end).filter(|range| !held.contains(&(range * RANGE))) {
         if sys::lock_byte(file.as_fd(), i64::from(range)).map_err(Error::file("lock", path))? {
             return Ok((range * RANGE, file));
         }
@@ -38,6 +43,25 @@ pub fn take(base: u32) -> Result<(u32, OwnedFd), Error> {
         base,
         ranges: end.saturating_sub(first),
     })
+}
+
+/// First uids of the ranges that the records below `servants` name, whether their shims run or not: of a servant whose shim was
+/// killed, processes may be left for as long as its directory is.
+pub fn held(servants: &Path) -> Result<BTreeSet<u32>, Error> {
+    /// What is the same in both records.
+    #[derive(serde::Deserialize)]
+    struct Held {
+        uid_range: (u32, u32),
+    }
+    let mut held = BTreeSet::new();
+    for entry in fs::read_dir(servants).map_err(Error::file("read", servants))? {
+        let directory = entry.map_err(Error::file("read", servants))?.path();
+        // What cannot be read was being written: nothing has those ids yet.
+        let record = |name| launch::read::<Held>(&directory.join(name)).ok().flatten();
+        let record = record(launch::RUNTIME).or_else(|| record(launch::SPEC));
+        held.extend(record.map(|record| record.uid_range.0));
+    }
+    Ok(held)
 }
 
 /// For this user alone: whoever can open it can hold any range, by a lock that only reads.
@@ -60,17 +84,41 @@ mod tests {
 
     #[test]
     fn a_range_is_taken_once_and_free_again_after_its_lock() {
-        // Far from where engines look, so that no other test's servant is in the way.
-        let base = 0x7ffd_0000 - RANGE;
-        let (one, lock) = take(base).unwrap();
-        let (two, _other) = take(base).unwrap();
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("uid-ranges");
+        let base = END - 2 * RANGE;
+        let nobody = BTreeSet::new();
+        let (one, lock) = take(&path, base, &nobody).unwrap();
+        let (two, _other) = take(&path, base, &nobody).unwrap();
         assert_eq!((one, two), (base, base + RANGE));
         assert!(matches!(
-            take(base),
+            take(&path, base, &nobody),
             Err(Error::NoUidRange { ranges: 2, .. })
         ));
         drop(lock);
-        assert_eq!(take(base).unwrap().0, base);
+        assert_eq!(take(&path, base, &nobody).unwrap().0, base);
+    }
+
+    #[test]
+    fn ranges_that_records_name_are_passed_over_without_their_locks() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("uid-ranges");
+        let servants = place.path().join("servants");
+        let base = END - 4 * RANGE;
+        for (index, (id, file)) in [("a", launch::RUNTIME), ("b", launch::SPEC)]
+            .into_iter()
+            .enumerate()
+        {
+            let record = servants.join(id).join(file);
+            fs::create_dir_all(record.parent().unwrap()).unwrap();
+            let first = base + index as u32 * RANGE;
+            let record_text = serde_json::json!({ "uid_range": [first, RANGE] });
+            fs::write(record, record_text.to_string()).unwrap();
+        }
+        fs::create_dir(servants.join("half-made")).unwrap();
+        let held = held(&servants).unwrap();
+        assert_eq!(held, BTreeSet::from([base, base + RANGE]));
+        assert_eq!(take(&path, base, &held).unwrap().0, base + 2 * RANGE);
     }
 
     #[test]

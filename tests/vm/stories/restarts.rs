@@ -1,8 +1,9 @@
 //! The daemon ends and begins again; robots notice no more than a lost connection.
 
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use anyhow::ensure;
+use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
@@ -10,6 +11,9 @@ use support::patience::Deadline;
 use support::robot::Robot;
 
 use crate::machine::{HOME, daemon, main_pid, types};
+
+/// By whose locks it is known which user ids are taken.
+const LOCKS: &str = "/run/cloudroid/uid-ranges";
 
 fn count(robot: &mut Robot) -> anyhow::Result<Option<u64>> {
     let answer = robot.calls("/greeter/count", json!({"reset": false}))?;
@@ -72,4 +76,38 @@ pub fn a_restart_loses_nothing() -> Verdict {
     counted_over("restarted", || {
         types("systemctl", &["restart", "cloudroid"]).map(|_| ())
     })
+}
+
+/// The first user id of a servant on the host, as the kernel has it.
+fn user_id(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
+    let servant = daemon.servant_of("greeter_cpp", robot)?;
+    let pid = servant["pids"]
+        .as_array()
+        .and_then(|pids| pids.first())
+        .and_then(Value::as_i64)
+        .context("a process")?;
+    let map = std::fs::read_to_string(format!("/proc/{pid}/uid_map"))?;
+    let first = map.split_whitespace().nth(1).context("a user id")?;
+    Ok(first.to_owned())
+}
+
+pub fn after_a_restart_of_the_unit_no_two_servants_have_the_same_user_ids() -> Verdict {
+    let first = daemon()?;
+    let mut before = first.robot("greeter_cpp?robot=older")?;
+    count(&mut before)?;
+    let locks = std::fs::metadata(LOCKS)?.ino();
+    let old = main_pid()?;
+    // Stopped and started again, as a package does on an upgrade: the directory below /run would be gone in between.
+    types("systemctl", &["stop", "cloudroid"])?;
+    ensure!(
+        std::fs::metadata(LOCKS).is_ok_and(|kept| kept.ino() == locks),
+        "the locks of servants that go on were removed"
+    );
+    types("systemctl", &["start", "cloudroid"])?;
+    let second = Daemon::of_another(Path::new(HOME), Some(old))?;
+    let mut after = second.robot("greeter_cpp?robot=newer")?;
+    count(&mut after)?;
+    let (older, newer) = (user_id(&second, "older")?, user_id(&second, "newer")?);
+    ensure!(older != newer, "both servants have {older} for their root");
+    Ok(())
 }

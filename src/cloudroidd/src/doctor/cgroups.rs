@@ -1,15 +1,19 @@
 //! Which cgroup controllers can limit servants here.
 
+use std::path::Path;
+
 use api::{Check, CheckStatus};
 
 const NAME: &str = "cgroup";
+
+const FIX: &str = "boot with systemd.unified_cgroup_hierarchy=1, and give the daemon its controllers (Delegate=yes)";
 
 /// What was found.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Found {
     /// 1 or 2; 0 where no controller can be used.
     pub version: u8,
-    /// Limits that cannot be set.
+    /// Limits that cannot be set. Buffers of sockets are not among them: they are told of, and no reason not to start.
     pub missing: Vec<String>,
     /// The reason, for people.
     pub why: String,
@@ -18,6 +22,16 @@ pub struct Found {
 /// The check for people.
 pub fn check() -> Check {
     let found = find();
+    if found.version == 1 && found.missing.is_empty() && !counts_sockets() {
+        return Check {
+            name: NAME.to_owned(),
+            status: CheckStatus::Warning,
+            found: "version 1: cpu, memory and pids can be limited, but this kernel does not count buffers of sockets: \
+                    what servants send one another and do not read may use up the machine's memory"
+                .to_owned(),
+            fix: Some(FIX.to_owned()),
+        };
+    }
     let status = match (found.version, found.missing.is_empty()) {
         (_, true) => CheckStatus::Ok,
         _ => CheckStatus::Warning,
@@ -28,7 +42,8 @@ pub fn check() -> Check {
             found.why
         ),
         (1, true) => {
-            "version 1: cpu, memory and pids can be limited; it has no memory.high".to_owned()
+            "version 1: cpu, memory and pids can be limited, buffers of sockets beside memory; it has no memory.high"
+                .to_owned()
         }
         (version, true) => format!("version {version}: cpu, memory and pids can be limited"),
         (version, false) => format!(
@@ -37,15 +52,34 @@ pub fn check() -> Check {
             found.why
         ),
     };
-    let fix = (status != CheckStatus::Ok).then(|| {
-        "boot with systemd.unified_cgroup_hierarchy=1, and give the daemon its controllers (Delegate=yes)".to_owned()
-    });
+    let fix = (status != CheckStatus::Ok).then(|| FIX.to_owned());
     Check {
         name: NAME.to_owned(),
         status,
         found: text,
         fix,
     }
+}
+
+/// Whether buffers of sockets can be limited where memory can be, on version 1.
+fn counts_sockets() -> bool {
+    let mounts = std::fs::read_to_string("/proc/self/mounts").unwrap_or_default();
+    let place = memory_hierarchy(&mounts);
+    place.is_some_and(|place| servant::cgroup::counts_sockets(Path::new(place)))
+}
+
+/// Where the hierarchy of version 1 is mounted that limits memory.
+fn memory_hierarchy(mounts: &str) -> Option<&str> {
+    mounts.lines().find_map(|line| {
+        let fields: Vec<&str> = line.split(' ').collect();
+        let [_, place, "cgroup", options, ..] = fields[..] else {
+            return None;
+        };
+        options
+            .split(',')
+            .any(|option| option == "memory")
+            .then_some(place)
+    })
 }
 
 /// Looks at the mounted hierarchies.
@@ -123,6 +157,11 @@ mod tests {
                       cgroup /sys/fs/cgroup/memory cgroup rw,relatime,memory 0 0\n\
                       cgroup /sys/fs/cgroup/pids cgroup ro,relatime,pids 0 0\n\
                       cgroup2 /sys/fs/cgroup/unified cgroup2 rw 0 0\n";
+        assert_eq!(memory_hierarchy(hybrid), Some("/sys/fs/cgroup/memory"));
+        assert_eq!(
+            memory_hierarchy("cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n"),
+            None
+        );
         let v1 = judge(hybrid, None);
         assert_eq!((v1.version, v1.missing), (1, vec!["pids".to_owned()]));
         let v2 = judge(

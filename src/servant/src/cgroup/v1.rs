@@ -19,6 +19,23 @@ const WRITE: &str = "blkio.throttle.write_bps_device";
 /// What `memory.limit_in_bytes` reads when there is no limit: the largest multiple of a page.
 const NO_LIMIT: u64 = 1 << 62;
 
+/// Buffers of sockets, of UDP as of TCP, whatever its name says. Version 1 counts them beside the memory, and only once there is
+/// a limit; what a process sends and nobody reads would else be nobody's.
+const SOCKETS: &str = "memory.kmem.tcp.limit_in_bytes";
+
+/// What buffers of sockets may have beside so much memory: a quarter of it.
+fn buffers_of_sockets(memory: u64) -> u64 {
+    match memory {
+        UNLIMITED => UNLIMITED,
+        memory => memory / 4,
+    }
+}
+
+/// Whether this kernel counts buffers of sockets in the hierarchy of the memory controller that is mounted there.
+pub fn counts_sockets(hierarchy: &Path) -> bool {
+    hierarchy.join(SOCKETS).exists()
+}
+
 pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     // Whether a write took effect is read back by the caller.
     let write = |controller, name, value: String| {
@@ -38,12 +55,15 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
         write("cpu", "cpu.shares", shares(weight).to_string());
     }
     if let Some(memory) = limits.memory {
+        let buffers = number(buffers_of_sockets(memory), "-1");
         // With swap may not be below without swap, in neither direction of the change: so both, twice.
         for _ in 0..2 {
             let memory = number(memory, "-1");
             write("memory", "memory.limit_in_bytes", memory.clone());
             write("memory", "memory.memsw.limit_in_bytes", memory);
         }
+        // Set before its processes make sockets: those that are there already are not counted.
+        write("memory", SOCKETS, buffers);
     }
     if let Some(pids) = limits.pids {
         write("pids", "pids.max", number(pids, "max"));

@@ -48,7 +48,9 @@ async fn start_in(
     directory: &Path,
 ) -> Result<Arc<LocalServant>, Error> {
     let network = shared.networks.take()?;
-    let (first, lock) = uids::take(shared.config.uid_base)?;
+    let config = &shared.config;
+    let held = uids::held(&config.home_servants_dir)?;
+    let (first, lock) = uids::take(&config.uid_locks, config.uid_base, &held)?;
     let launch = Launch {
         uid_range: (first, uids::RANGE),
         parent: shared.parent.clone(),

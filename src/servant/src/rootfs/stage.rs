@@ -1,18 +1,15 @@
 //! The place where a root is put together, and what lets layers belong to other users there.
 
 use std::fs;
-use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::path::{Path, PathBuf};
 
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use nix::sched::{CloneFlags, unshare};
-use nix::sys::wait::waitpid;
-use nix::unistd::ForkResult;
 
 use super::make_directory;
 use crate::container::Mount;
-use crate::{Error, idmap, sys};
+use crate::{Error, sys};
 
 /// A directory that every host has and every user can reach, and that must be covered anyway.
 const STAGE: &str = "/sys/fs/cgroup";
@@ -138,38 +135,6 @@ fn filesystem_of(path: &Path) -> String {
         .filter_map(holds)
         .max_by_key(|(length, _)| *length);
     found.map_or_else(|| "an unknown filesystem".into(), |(_, kind)| kind)
-}
-
-/// A user namespace whose root is the first uid of the range. The kernel gives its map to mounts; nobody lives in it.
-pub(super) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
-    let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
-    let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
-    // SAFETY: the calling process has one thread (see Rootfs::mount); the child makes system calls only.
-    match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork"))? {
-        ForkResult::Child => {
-            drop(release);
-            let done = [u8::from(unshare(CloneFlags::CLONE_NEWUSER).is_ok())];
-            let _ = nix::unistd::write(&tell, &done);
-            let _ = nix::unistd::read(&wait, &mut [0]);
-            // SAFETY: ends the child without running what the parent has registered for its own end.
-            unsafe { libc::_exit(0) }
-        }
-        ForkResult::Parent { child } => {
-            drop(tell);
-            let mut done = [0];
-            let read = nix::unistd::read(&unshared, &mut done);
-            let opened = if read == Ok(1) && done == [1] {
-                idmap::map(child.as_raw(), range)
-            } else {
-                Err(Error::call("unshare of a user namespace")(io::Error::from(
-                    io::ErrorKind::PermissionDenied,
-                )))
-            };
-            drop(release);
-            let _ = waitpid(child, None);
-            opened
-        }
-    }
 }
 
 #[cfg(test)]

@@ -128,6 +128,8 @@ struct Ready {
     /// Where libcontainer keeps its records. Nobody needs them later, and on a disk their writing took as long as a
     /// fifth of the creation: this is in memory, and goes with the creator's mount namespace.
     records: PathBuf,
+    /// The configuration names it by its number.
+    _user_namespace: OwnedFd,
 }
 
 /// Everything that libcontainer is to find: root, volumes, configuration.
@@ -158,8 +160,8 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
     rootfs
         .make_owned(&staged.root, &launch.spec.owned_directories)
         .map_err(|error| text(&error))?;
-    let config = bundle::config(&launch.spec, &staged, launch.uid_range, &launch.quotas())
-        .map_err(|error| text(&error))?;
+    let config =
+        bundle::config(&launch.spec, &staged, &launch.quotas()).map_err(|error| text(&error))?;
     let file = directory.join("config.json");
     let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
     let mut options = File::options();
@@ -171,6 +173,7 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
     Ok(Ready {
         init,
         records: staged.root.with_file_name("records"),
+        _user_namespace: staged.user_namespace,
     })
 }
 

@@ -47,6 +47,29 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
 }
 
 #[tokio::test]
+async fn user_ids_of_an_adopted_servant_are_given_to_no_other_although_its_lock_is_gone() {
+    let place = tempfile::tempdir().unwrap();
+    let locks = place.path().join("uid-ranges");
+    // Far from where engines look by default, so that no other file is about these.
+    let world = World::with(|config| {
+        config.uid_locks = locks.clone();
+        config.uid_base = 0x7f00_0000;
+    });
+    let first = world.start(spec(vec![])).await;
+    let uids = first.uid_range();
+    drop(first);
+    // As whoever keeps /run tidy does when a service ends.
+    std::fs::remove_file(&locks).unwrap();
+    let engine = world.restarted();
+    let first = world.adopted(&engine).await;
+    let second = engine.start_container(spec(vec![])).await.unwrap();
+    assert_eq!(first.uid_range(), uids);
+    assert_ne!(second.uid_range(), uids);
+    world.stop(first).await;
+    world.stop(second).await;
+}
+
+#[tokio::test]
 async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
     let world = World::new();
     let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;

@@ -1,5 +1,6 @@
 //! What a node cannot do.
 
+use servant::bundle;
 use servant::container::{Mount, Opened, Profile};
 use servant::engine::{LogStart, Servant};
 
@@ -21,6 +22,33 @@ async fn a_shim_may_end_processes_and_nothing_else() {
         ("NoNewPrivs", "1"),
     ] {
         assert_eq!(status_field(shim, name), value, "{name}");
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn a_shim_that_was_taken_over_reaches_nothing_of_roots() {
+    let world = World::new();
+    let socket = world.path("of-root.sock");
+    let _listener = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+    let mut spec = spec(vec![]);
+    spec.resident = serde_json::json!({ "pries": socket });
+    let servant = world.start(spec).await;
+    let told = hear(&servant, 11311).await.unwrap();
+    let mut lines = told.lines();
+    assert_eq!(lines.next(), Some("own file: allowed"), "{told}");
+    assert_eq!(lines.clone().count(), 6, "{told}");
+    assert!(lines.all(|line| !line.ends_with("allowed")), "{told}");
+    let shim = world.runtime(servant.id()).shim.pid;
+    assert_eq!(status_field(shim, "Seccomp"), "2");
+    // It changes limits, and ends its servant, as ever.
+    let change = servant::spec::Limits {
+        memory: Some(64 << 20),
+        ..Default::default()
+    };
+    if world.has("memory") {
+        let enforced = servant.set_limits(change).await.unwrap();
+        assert_eq!(enforced.limits.memory, Some(64 << 20));
     }
     world.stop(servant).await;
 }
@@ -86,11 +114,62 @@ async fn no_way_out_is_open() {
         answer("clone3: ").contains("not implemented"),
         "so that the C library falls back"
     );
+    // By the filter, not by the kernel, which has such families or loads them.
+    for family in ["netlink", "tipc"] {
+        let answer = answer(&format!("{family} socketpair: "));
+        assert!(answer.contains("not implemented"), "{family}: {answer}");
+    }
     assert!(
         answer("clone with a new user namespace: ").contains("not implemented")
             || answer("clone with a new user namespace: ").contains("not permitted")
     );
     world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn a_servant_uses_up_counts_of_its_own_alone() {
+    let world = World::new();
+    let mut told = Vec::new();
+    let mut servants = Vec::new();
+    // The second finds as much as the first, which still holds all that it got.
+    for _ in 0..2 {
+        let servant = world.start(spec(vec![node("/greedy", &["exhaust"])])).await;
+        let mut lines = servant.follow(LogStart::First);
+        let line = lines_until(&mut lines, |line| line.stream == "stdout").await;
+        let counts: Vec<u64> = line[line.len() - 1]
+            .line
+            .split(' ')
+            .map(|count| count.parse().unwrap())
+            .collect();
+        told.push(counts);
+        servants.push(servant);
+    }
+    assert!(told[0].iter().all(|count| *count > 0), "{told:?}");
+    assert_eq!(told[0], told[1]);
+    let [_, signals, instances, terminals] = told[0][..] else {
+        panic!("{told:?}")
+    };
+    assert!(signals <= bundle::PENDING_SIGNALS, "{told:?}");
+    assert!(instances <= bundle::INOTIFY_INSTANCES, "{told:?}");
+    assert!(terminals <= bundle::TERMINALS, "{told:?}");
+    // And this process, which is root's, has what it always had.
+    let watch = nix::sys::inotify::Inotify::init(nix::sys::inotify::InitFlags::empty());
+    watch.expect("an inotify instance for root");
+    let mut timer = std::ptr::null_mut();
+    // SAFETY: no event, which means a signal, and a place for the timer.
+    let made =
+        unsafe { libc::timer_create(libc::CLOCK_MONOTONIC, std::ptr::null_mut(), &raw mut timer) };
+    assert_eq!(
+        made,
+        0,
+        "a timer for root: {}",
+        std::io::Error::last_os_error()
+    );
+    // SAFETY: made just now.
+    unsafe { libc::timer_delete(timer) };
+    for servant in servants {
+        world.stop(servant).await;
+    }
 }
 
 #[tokio::test]

@@ -173,6 +173,28 @@ async fn nodes_stay_on_the_cores_they_were_given() {
 }
 
 #[tokio::test]
+async fn what_nobody_reads_of_sockets_is_bounded_with_the_memory() {
+    let world = World::new();
+    world.needs(&["memory"]);
+    const MEMORY: u64 = 32 << 20;
+    let mut spec = spec(vec![node("/sends", &["buffer"])]);
+    spec.limits.memory = Some(MEMORY);
+    let servant = world.start(spec).await;
+    let mut lines = servant.follow(LogStart::First);
+    let told = lines_until(&mut lines, |line| line.stream == "stdout").await;
+    let kept: Vec<u64> = told[told.len() - 1]
+        .line
+        .split(' ')
+        .map(|bytes| bytes.parse().unwrap())
+        .collect();
+    // Without a limit it is some hundred MiB by TCP, and 60 by UDP.
+    for kept in &kept {
+        assert!((1..MEMORY).contains(kept), "{kept:?}");
+    }
+    world.stop(servant).await;
+}
+
+#[tokio::test]
 async fn a_soft_limit_of_memory_holds_or_is_refused_by_name() {
     let world = World::new();
     world.needs(&["memory"]);

@@ -78,6 +78,8 @@ pub fn act(words: &[String]) -> i32 {
         "shared" => return status(shared(&words[1]).map(|text| println!("{text}"))),
         "fill" => return status(fill(&words[1], number(2))),
         "calls" => refused_calls(),
+        "buffer" => return status(buffer()),
+        "exhaust" => return status(exhaust()),
         other => {
             eprintln!("unknown word {other}");
             return 99;
@@ -157,6 +159,93 @@ fn fill(path: &str, mebibytes: u64) -> io::Result<()> {
         file.write_all(&vec![1; 1 << 20])?;
     }
     println!("filled");
+    loop {
+        std::thread::sleep(Duration::from_secs(60));
+    }
+}
+
+/// Has the kernel keep as much as it will for sockets that nobody reads, says how many bytes by TCP and how many by UDP, and stays.
+fn buffer() -> io::Result<()> {
+    use std::net::{TcpListener, TcpStream, UdpSocket};
+    const SOCKETS: usize = 100;
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let (mut by_tcp, mut by_udp) = (0, 0);
+    let mut streams = Vec::new();
+    for _ in 0..SOCKETS {
+        let mut sender = TcpStream::connect(listener.local_addr()?)?;
+        streams.push(listener.accept()?.0);
+        sender.set_nonblocking(true)?;
+        while let Ok(sent) = sender.write(&[7; 65_536]) {
+            by_tcp += sent;
+        }
+        streams.push(sender);
+    }
+    drop(streams);
+    let mut sockets = Vec::new();
+    for _ in 0..SOCKETS * 4 {
+        let socket = UdpSocket::bind("127.0.0.1:0")?;
+        socket.set_nonblocking(true)?;
+        for _ in 0..400 {
+            // What finds no room is lost, here or on its way.
+            let _ = socket.send_to(&[7; 1000], socket.local_addr()?);
+        }
+        sockets.push(socket);
+    }
+    for socket in &sockets {
+        while let Ok(kept) = socket.recv(&mut [0; 1000]) {
+            by_udp += kept;
+        }
+    }
+    println!("{by_tcp} {by_udp}");
+    loop {
+        std::thread::sleep(Duration::from_secs(60));
+    }
+}
+
+/// Takes all that it is given of what the kernel counts by user, says how many of each, and stays.
+fn exhaust() -> io::Result<()> {
+    let mut queues = 0;
+    let mut name = CString::new(format!("/queue-{queues}"))?;
+    // SAFETY: a name that outlives the call; no attributes.
+    while unsafe {
+        libc::mq_open(
+            name.as_ptr(),
+            libc::O_CREAT | libc::O_RDWR,
+            0o600,
+            std::ptr::null::<u8>(),
+        )
+    } >= 0
+    {
+        queues += 1;
+        name = CString::new(format!("/queue-{queues}"))?;
+    }
+    let signal = libc::SIGRTMIN();
+    // SAFETY: a signal set is made empty before it is used; a blocked signal runs no code.
+    unsafe {
+        let mut blocked: libc::sigset_t = std::mem::zeroed();
+        libc::sigemptyset(&mut blocked);
+        libc::sigaddset(&mut blocked, signal);
+        libc::sigprocmask(libc::SIG_BLOCK, &blocked, std::ptr::null_mut());
+    }
+    let nothing = libc::sigval {
+        sival_ptr: std::ptr::null_mut(),
+    };
+    let mut signals = 0;
+    // SAFETY: this very process, which has blocked the signal.
+    while unsafe { libc::sigqueue(libc::getpid(), signal, nothing) } == 0 {
+        signals += 1;
+    }
+    let mut instances = 0;
+    // SAFETY: no pointers.
+    while unsafe { libc::inotify_init1(0) } >= 0 {
+        instances += 1;
+    }
+    let mut terminals = 0;
+    // SAFETY: a path that outlives the call.
+    while unsafe { libc::open(c"/dev/ptmx".as_ptr(), libc::O_RDWR | libc::O_NOCTTY) } >= 0 {
+        terminals += 1;
+    }
+    println!("{queues} {signals} {instances} {terminals}");
     loop {
         std::thread::sleep(Duration::from_secs(60));
     }
@@ -336,6 +425,24 @@ fn refused_calls() {
             "packet socket",
             i64::from(libc::socket(libc::AF_PACKET, libc::SOCK_RAW, 0)),
         );
+        // What is read and written so counts with the whole host (fs.aio-max-nr).
+        let mut context = 0_u64;
+        tell(
+            "asynchronous input and output",
+            libc::syscall(libc::SYS_io_setup, 1, &raw mut context),
+        );
+        let mut pair = [0; 2];
+        for (name, family) in [("netlink", libc::AF_NETLINK), ("tipc", libc::AF_TIPC)] {
+            tell(
+                &format!("{name} socketpair"),
+                i64::from(libc::socketpair(
+                    family,
+                    libc::SOCK_SEQPACKET,
+                    0,
+                    pair.as_mut_ptr(),
+                )),
+            );
+        }
         tell(
             "vsock",
             i64::from(libc::socket(libc::AF_VSOCK, libc::SOCK_STREAM, 0)),

@@ -59,11 +59,17 @@ impl Resident for Greeter {
             }
             let listener = tokio::net::TcpListener::bind("127.0.0.1:11311").await?;
             let (config, ended) = (context.config.clone(), self.ended.clone());
+            let directory = context.directory.clone();
             tokio::task::spawn_local(async move {
                 use tokio::io::AsyncWriteExt;
                 while let Ok((mut stream, _)) = listener.accept().await {
                     if config.get("eat").is_some() {
                         std::hint::black_box(vec![7_u8; 256 << 20]);
+                    }
+                    if let Some(socket) = config.get("pries").and_then(|place| place.as_str()) {
+                        let tried = pry(Path::new(socket), &directory);
+                        let _ = stream.write_all(tried.as_bytes()).await;
+                        continue;
                     }
                     let text = format!("{config} {}", ended.get());
                     let _ = stream.write_all(text.as_bytes()).await;
@@ -76,6 +82,32 @@ impl Resident for Greeter {
     fn process_exited(&mut self, _pid: i32) {
         self.ended.set(self.ended.get() + 1);
     }
+}
+
+/// What a shim does that was taken over: it tries to get out, by a socket of root's among others, and to work in its own directory.
+/// A line for each try: `allowed`, or why not.
+fn pry(socket: &Path, directory: &Path) -> String {
+    let outside = socket.with_file_name("outside");
+    let tries: [(&str, std::io::Result<()>); 7] = [
+        ("own file", std::fs::write(directory.join("own"), "x")),
+        ("write outside", std::fs::write(&outside, "x")),
+        ("read outside", std::fs::read("/etc/passwd").map(drop)),
+        ("list outside", std::fs::read_dir("/etc").map(drop)),
+        ("program", Command::new("/bin/true").status().map(drop)),
+        (
+            "socket of root",
+            std::os::unix::net::UnixStream::connect(socket).map(drop),
+        ),
+        (
+            "pair of sockets",
+            std::os::unix::net::UnixDatagram::pair().map(drop),
+        ),
+    ];
+    let told = tries.map(|(name, outcome)| match outcome {
+        Ok(()) => format!("{name}: allowed\n"),
+        Err(error) => format!("{name}: {error}\n"),
+    });
+    told.concat()
 }
 
 /// An engine and all that belongs to it.

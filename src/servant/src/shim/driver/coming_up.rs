@@ -34,7 +34,8 @@ impl Driver {
         }
         created?;
         resident.map_err(|error| format!("its resident did not start: {error}"))?;
-        privileges::drop_all_but_kill().map_err(|error| error.to_string())?;
+        let cgroups = [&self.begun.cgroup, &self.begun.shim_cgroup];
+        privileges::confine(&self.begun.directory, cgroups).map_err(|error| error.to_string())?;
         let ready = tokio::time::timeout(CREATION, self.link.receive()).await;
         match ready {
             Ok(Ok(Some((Reply::Ready, _)))) => {}
