@@ -151,23 +151,26 @@ impl Catalogue {
     pub async fn repair(&self) -> Result<(), Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("repairing the image store", move || {
+            let tagged = store.tags()?;
+            // Each change of a tag writes the index anew, and robots wait for all of them.
+            let keep = |name: &str, image: &str| match tagged.get(name) {
+                Some(known) if *known == digest(image)? => Ok(()),
+                _ => set_tag(&store, name, image),
+            };
             let mut wanted = BTreeSet::new();
             for revision in state.all_revisions()? {
-                tag(&store, &revision.service, revision.number, &revision.image)?;
-                wanted.insert(format!("{}:{}", revision.service, revision.number));
+                let name = format!("{}:{}", revision.service, revision.number);
+                keep(&name, &revision.image)?;
+                wanted.insert(name);
             }
             for service in state.service_names()? {
                 if let Some(current) = state.current(&service)? {
-                    tag_current(&store, &service, &current.image)?;
+                    keep(&service, &current.image)?;
                 }
                 wanted.insert(service);
             }
-            for tag in store
-                .tags()?
-                .into_keys()
-                .filter(|tag| !wanted.contains(tag))
-            {
-                store.untag(&tag)?;
+            for tag in tagged.keys().filter(|tag| !wanted.contains(*tag)) {
+                store.untag(tag)?;
             }
             Ok(())
         })

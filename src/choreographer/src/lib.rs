@@ -65,6 +65,7 @@ pub use decide::dictionary::{MOST_ROWS, check as check_row};
 pub use decide::terms::{Cap, Capper, Untenable};
 pub use error::{Error, Unchanged, with_last_words};
 pub use limits::engine_limits;
+pub use lives::adoption::Inheritance;
 pub use lives::calibration::Requests;
 pub use lives::capture::Bounds;
 pub use lives::handle::Handle;

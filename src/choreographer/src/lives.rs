@@ -1,7 +1,7 @@
 //! The tasks that carry out what was decided: one for each servant ([`driver`]), which alone changes its state, and one that
 //! keeps the warm pool ([`warm_pool`]), and one that looks at the machine and moves cores ([`controller`]). Servants of an earlier daemon are taken over here ([`adoption`]).
 
-mod adoption;
+pub(crate) mod adoption;
 pub(crate) mod back_off;
 pub(crate) mod calibration;
 pub(crate) mod capture;

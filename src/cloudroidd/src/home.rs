@@ -195,25 +195,25 @@ impl Home {
         self.path.join("run/daemon.sock")
     }
 
-    /// Removes what an earlier daemon's builds left half-made, once their containers have ended, and before that
-    /// detaches what is mounted there: it may be a directory of the host. What cannot be removed is told and is no reason not to start.
-    pub fn sweep_builds(&self) {
-        let builds = self.path.join("build");
-        if let Err(error) = mounts::detach_below(&builds) {
-            tracing::error!("cannot sweep {}: {error}", builds.display());
-            return;
+    /// What an earlier daemon's builds left half-made. To be asked before any build begins.
+    pub fn half_made_builds(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.path.join("build"));
+        let entries = entries.into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).collect()
+    }
+}
+
+/// Removes half-made builds, once their containers have ended, and before that detaches what is mounted there: it may be a
+/// directory of the host. Blocking. What cannot be removed is told, and the next start tries again.
+pub fn sweep_builds(half_made: &[PathBuf]) {
+    for half_made in half_made {
+        if let Err(error) = mounts::detach_below(half_made) {
+            tracing::error!("cannot sweep {}: {error}", half_made.display());
+            continue;
         }
-        let entries = std::fs::read_dir(&builds);
-        for half_made in entries
-            .into_iter()
-            .flatten()
-            .flatten()
-            .map(|entry| entry.path())
-        {
-            match foreign::remove(&half_made) {
-                Ok(()) => tracing::info!("swept the half-made build {}", half_made.display()),
-                Err(error) => tracing::error!("cannot sweep {}: {error}", half_made.display()),
-            }
+        match foreign::remove(half_made) {
+            Ok(()) => tracing::info!("swept the half-made build {}", half_made.display()),
+            Err(error) => tracing::error!("cannot sweep {}: {error}", half_made.display()),
         }
     }
 }
@@ -513,7 +513,7 @@ mod tests {
         std::fs::create_dir_all(home.path().join("build/p1/deep")).expect("a build");
         drop(home);
         let home = Home::open(parent.path()).expect("free");
-        home.sweep_builds();
+        sweep_builds(&home.half_made_builds());
         assert!(!home.path().join("build/p1").exists());
     }
 

@@ -33,6 +33,7 @@ use anyhow::{Context, bail};
 use clap::{Parser, Subcommand};
 use portal::Machine;
 use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
 use tracing_subscriber::EnvFilter;
 
 use config::{Config, IsolationMode};
@@ -234,19 +235,19 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
     }
-    app.pusher
+    app.catalogue
         .repair()
         .await
         .context("cannot repair the image store")?;
     app.choreographer
         .keep_rollouts()
         .context("cannot go on with the rollouts of an earlier daemon")?;
-    let adopted = app
+    let half_made = home.half_made_builds();
+    let choreographer::Inheritance { adopted, removal } = app
         .choreographer
         .adopt()
         .await
         .context("cannot take over the servants of an earlier daemon")?;
-    home.sweep_builds();
     let router = portal::router(Arc::clone(&app));
     let tcp = tokio::spawn(portal::serve_tcp(
         Arc::clone(&app),
@@ -290,6 +291,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         home.path().display()
     );
     supervision::ready();
+    tokio::spawn(tidy(Arc::clone(&app), removal, half_made));
     app.catalogue.complete().await?;
     app.choreographer.watch_nodes();
     app.choreographer.keep_warm_pool();
@@ -301,6 +303,16 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     let _ = tokio::join!(tcp, unix, members, history, observers);
     let _ = std::fs::remove_file(home.socket());
     Ok(())
+}
+
+/// Removes what an earlier daemon left, beside robots that are served already: containers, then the builds that they worked at,
+/// then what of the image store nothing needs. What is interrupted the next start goes on with.
+async fn tidy(app: Arc<portal::App>, removal: JoinHandle<()>, half_made: Vec<PathBuf>) {
+    if let Err(panic) = removal.await {
+        tracing::error!("what an earlier daemon left could not be removed: {panic}");
+    }
+    let _ = privilege::blocking(move || home::sweep_builds(&half_made)).await;
+    app.pusher.collect_garbage().await;
 }
 
 async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {

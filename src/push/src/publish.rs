@@ -85,14 +85,8 @@ impl Pusher {
         Ok(stopped)
     }
 
-    /// Makes image store and database say the same, then removes what nothing needs.
-    pub async fn repair(&self) -> Result<(), Error> {
-        self.catalogue.repair().await?;
-        self.collect_garbage().await;
-        Ok(())
-    }
-
-    pub(super) async fn collect_garbage(&self) {
+    /// Removes what of the image store nothing needs. A failure is logged alone.
+    pub async fn collect_garbage(&self) {
         let builder = Arc::clone(&self.builder);
         let mut keep = privilege::blocking(move || builder.keep())
             .await

@@ -208,9 +208,9 @@ pub struct Ended {
 pub struct Adopted {
     /// Servants that run.
     pub running: Vec<Arc<dyn Servant>>,
-    /// Servants that have ended; nothing is left of them.
+    /// Servants that have ended. What is left of them is in nobody's way until [`Engine::sweep`] removes it.
     pub ended: Vec<Ended>,
-    /// Leftovers that could not be removed, each with the reason. Nothing of them is in anybody's way.
+    /// What could not be looked at, each with the reason.
     pub failures: Vec<crate::Error>,
 }
 
@@ -219,9 +219,11 @@ pub struct Adopted {
 pub trait Engine: Send + Sync + 'static {
     /// Starts one; returns once its container runs and its nodes are started or starting.
     async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, crate::Error>;
-    /// Those that an earlier daemon left, one by one: adopted where they run, else removed. Fails only where nothing can
-    /// be looked at.
+    /// Finds those that an earlier daemon left: adopted where they run, else told. Robots wait for it, so nothing is removed.
+    /// Fails only where nothing can be looked at.
     async fn adopt(&self) -> Result<Adopted, crate::Error>;
+    /// Removes what is left of servants that have ended; answers, with the reasons, what could not be removed.
+    async fn sweep(&self, ended: &[Ended]) -> Vec<crate::Error>;
     /// Refuses grants that are not allowed or not there; answers, in words, what of them servants will lack.
     fn check(&self, grants: &Grants) -> Result<Vec<String>, crate::Error>;
 }

@@ -11,6 +11,7 @@ use api::Grants;
 
 use async_trait::async_trait;
 use tokio::sync::oneshot;
+use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::cgroup::Parent;
@@ -324,52 +325,66 @@ impl Engine for LocalEngine {
         privilege::run(async move { engine.adopt_all().await }).await
     }
 
+    async fn sweep(&self, ended: &[Ended]) -> Vec<Error> {
+        let (engine, ended) = (self.clone(), ended.to_vec());
+        privilege::run(async move { engine.sweep_all(&ended).await }).await
+    }
+
     fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {
         let (engine, grants) = (self.clone(), grants.clone());
         privilege::now(move || Ok(engine.granted(&grants)?.unfulfilled))
     }
 }
 
+/// What a directory of a servant turned out to be.
+enum Found {
+    Running(Arc<LocalServant>),
+    Ended(Ended),
+}
+
 impl LocalEngine {
+    /// Looks at all at once: a shim that does not answer is waited for.
     async fn adopt_all(&self) -> Result<Adopted, Error> {
         let home = &self.shared.config.home_servants_dir;
         let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
-        let mut adoption = Adopted::default();
+        let mut looks = JoinSet::new();
         for entry in entries {
-            let entry = match entry.map_err(Error::file("read", home)) {
-                Ok(entry) => entry,
-                Err(error) => {
-                    adoption.failures.push(error);
-                    continue;
-                }
-            };
-            let directory = entry.path();
-            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-                // None of ours: it is left to whoever put it there.
-                adoption.failures.push(Error::Stray { path: directory });
-                continue;
-            }
-            let id = directory
-                .file_name()
-                .unwrap_or_default()
-                .to_string_lossy()
-                .into_owned();
-            match self.adopt_one(&id, &directory).await {
-                Ok(Some(servant)) => adoption.running.push(servant),
-                Ok(None) => {
-                    let exit: Option<Exit> =
-                        launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
-                    match sweep::sweep(&id, &directory).await {
-                        Ok(()) => adoption.ended.push(Ended {
-                            id,
-                            state: exit.map(|exit| exit.state),
-                        }),
-                        Err(error) => adoption.failures.push(error),
-                    }
-                }
-                Err(error) => adoption.failures.push(error),
+            let entry = entry.map_err(Error::file("read", home))?;
+            let engine = self.clone();
+            looks.spawn(async move { engine.look(&entry).await });
+        }
+        let mut adopted = Adopted::default();
+        for found in looks.join_all().await {
+            match found {
+                Ok(Found::Running(servant)) => adopted.running.push(servant),
+                Ok(Found::Ended(ended)) => adopted.ended.push(ended),
+                Err(error) => adopted.failures.push(error),
             }
         }
-        Ok(adoption)
+        Ok(adopted)
+    }
+
+    async fn look(&self, entry: &std::fs::DirEntry) -> Result<Found, Error> {
+        let directory = entry.path();
+        if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            // None of ours: it is left to whoever put it there.
+            return Err(Error::Stray { path: directory });
+        }
+        let id = entry.file_name().to_string_lossy().into_owned();
+        if let Some(servant) = self.adopt_one(&id, &directory).await? {
+            return Ok(Found::Running(servant));
+        }
+        let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+        let state = exit.map(|exit| exit.state);
+        Ok(Found::Ended(Ended { id, state }))
+    }
+
+    async fn sweep_all(&self, ended: &[Ended]) -> Vec<Error> {
+        let home = &self.shared.config.home_servants_dir;
+        let mut failures = Vec::new();
+        for Ended { id, .. } in ended {
+            failures.extend(sweep::sweep(id, &home.join(id)).await.err());
+        }
+        failures
     }
 }

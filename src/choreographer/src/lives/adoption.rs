@@ -3,30 +3,51 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use super::driver::{self, Beginning};
-use super::warm_pool::NOBODY;
-use servant::engine::ContainerState;
+use api::Limits;
+use servant::engine::{Adopted, ContainerState, Ended, Servant};
+use store::{NewEvent, RevisionRecord, ServantRecord};
+use tokio::task::JoinHandle;
 
+use super::driver::{self, Beginning};
+use super::waiting::Permit;
+use super::warm_pool::NOBODY;
 use crate::Error;
 use crate::decide::adoption::{Fate, Found, Started, fate, is_linked};
 use crate::decide::demand::Asked;
 use crate::{Choreographer, Handle};
-use store::{NewEvent, RevisionRecord, ServantRecord};
 
 /// It was kept ready for a robot that had not come.
 fn is_nobodys(record: &ServantRecord) -> bool {
     record.robot == NOBODY
 }
 
+/// What an earlier daemon left.
+pub struct Inheritance {
+    /// How many servants were taken over.
+    pub adopted: usize,
+    /// Ends and removes what is of no use, beside everything else; robots need not wait for it.
+    pub removal: JoinHandle<()>,
+}
+
+/// A container that runs and is nobody's any more.
+struct Useless {
+    servant: Arc<dyn Servant>,
+    fate: Fate,
+    /// What it has is promised to nobody else before it has ended.
+    _permit: Permit,
+}
+
 impl Choreographer {
     /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
-    pub async fn adopt(&self) -> Result<usize, Error> {
+    pub async fn adopt(&self) -> Result<Inheritance, Error> {
         let inner = &self.inner;
-        let found = inner.engine.adopt().await?;
-        for error in &found.failures {
-            let message = format!("what an earlier daemon left could not be removed: {error}");
-            let about = NewEvent::default();
-            inner.journal.warning("servant-leftover", &message, &about);
+        let Adopted {
+            running,
+            ended,
+            failures,
+        } = inner.engine.adopt().await?;
+        for error in &failures {
+            self.report_leftover(error);
         }
         let mut records: HashMap<String, ServantRecord> = inner
             .state
@@ -35,7 +56,8 @@ impl Choreographer {
             .map(|record| (record.id.clone(), record))
             .collect();
         let mut adopted = 0;
-        for servant in found.running {
+        let mut useless = Vec::new();
+        for servant in running {
             let record = records.remove(servant.id());
             let revision = match &record {
                 Some(record) => inner.state.revision(&record.service, record.revision)?,
@@ -47,43 +69,55 @@ impl Choreographer {
                 published: revision.is_some(),
                 empty: servant.nodes().is_empty(),
             });
-            match (fate, record.zip(revision)) {
-                (Fate::Kept, Some((record, revision))) => {
+            match (fate, record, revision) {
+                (Fate::Kept, Some(record), Some(revision)) => {
                     self.adopt_one(record, revision, servant);
                     adopted += 1;
                 }
-                (Fate::Unused, _) => {
-                    self.end_unknown(&servant).await;
-                    inner.state.remove_servant(servant.id());
-                }
-                (Fate::Unknown | Fate::Kept, _) => {
-                    inner.journal.warning(
-                        "servant-unknown",
-                        &format!(
-                            "ended servant {}, which belongs to no service any more",
-                            servant.id()
-                        ),
-                        &NewEvent {
-                            servant: Some(servant.id()),
-                            ..NewEvent::default()
-                        },
-                    );
-                    self.end_unknown(&servant).await;
-                    inner.state.remove_servant(servant.id());
+                (fate, _, revision) => {
+                    let had = revision.map_or(Limits::default(), |revision| {
+                        inner.of_push(&revision).promised()
+                    });
+                    useless.push(Useless {
+                        servant,
+                        fate,
+                        _permit: inner.admission.adopt(inner.promised(&had)),
+                    });
                 }
             }
         }
-        let mut ends: HashMap<String, Option<ContainerState>> = found
-            .ended
-            .into_iter()
-            .map(|ended| (ended.id, ended.state))
+        self.forget(records, &ended);
+        let whole = self.clone();
+        let removal = tokio::spawn(async move {
+            let ends = useless.into_iter().map(|useless| whole.end(useless));
+            futures_util::future::join_all(ends).await;
+            for error in whole.inner.engine.sweep(&ended).await {
+                whole.report_leftover(&error);
+            }
+        });
+        Ok(Inheritance { adopted, removal })
+    }
+
+    fn report_leftover(&self, error: &servant::Error) {
+        let message = format!("what an earlier daemon left could not be removed: {error}");
+        let about = NewEvent::default();
+        let journal = &self.inner.journal;
+        journal.warning("servant-leftover", &message, &about);
+    }
+
+    /// Forgets servants that are gone, and tells how they ended.
+    fn forget(&self, records: HashMap<String, ServantRecord>, ended: &[Ended]) {
+        let inner = &self.inner;
+        let ends: HashMap<&str, Option<&ContainerState>> = ended
+            .iter()
+            .map(|ended| (ended.id.as_str(), ended.state.as_ref()))
             .collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
             if is_nobodys(&gone) {
                 continue;
             }
-            let why = match ends.remove(&gone.id).flatten() {
+            let why = match ends.get(gone.id.as_str()).copied().flatten() {
                 Some(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
                     format!(": {reason}")
                 }
@@ -102,27 +136,32 @@ impl Choreographer {
                 },
             );
         }
-        Ok(adopted)
     }
 
-    /// Ends a servant that nobody needs. What cannot be removed of it is told, and is in nobody's way.
-    async fn end_unknown(&self, servant: &Arc<dyn servant::engine::Servant>) {
+    /// Ends a container that nobody needs. What cannot be removed of it is told, and is in nobody's way.
+    async fn end(&self, useless: Useless) {
+        let (inner, servant) = (&self.inner, &useless.servant);
+        let about = NewEvent {
+            servant: Some(servant.id()),
+            ..NewEvent::default()
+        };
+        if useless.fate != Fate::Unused {
+            let id = servant.id();
+            let message = format!("ended servant {id}, which belongs to no service any more");
+            inner.journal.warning("servant-unknown", &message, &about);
+        }
         if let Err(error) = servant.stop().await {
             let message = format!("servant {} could not be cleaned up: {error}", servant.id());
-            let about = NewEvent {
-                servant: Some(servant.id()),
-                ..NewEvent::default()
-            };
-            let journal = &self.inner.journal;
-            journal.error("servant-leftover", &message, &about);
+            inner.journal.error("servant-leftover", &message, &about);
         }
+        inner.state.remove_servant(servant.id());
     }
 
     fn adopt_one(
         &self,
         record: ServantRecord,
         revision: Arc<RevisionRecord>,
-        servant: Arc<dyn servant::engine::Servant>,
+        servant: Arc<dyn Servant>,
     ) {
         let inner = &self.inner;
         let of_push = || inner.of_push(&revision);

@@ -118,7 +118,9 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     }
     // One that moves cores itself goes on from what is.
     let next = daemon(true);
-    assert_eq!(next.adopt().await.expect("adopted"), 3);
+    let inherited = next.adopt().await.expect("adopted");
+    assert_eq!(inherited.adopted, 3);
+    inherited.removal.await.expect("no panic");
     let there = async |daemon: &Choreographer| {
         for servant in daemon.servants() {
             let mut life = servant.watch();
@@ -129,7 +131,9 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     there(&next).await;
     assert_eq!(limits(&moved), (Some(1.5), Some(1500)));
     let last = daemon(false);
-    assert_eq!(last.adopt().await.expect("adopted"), 3);
+    let inherited = last.adopt().await.expect("adopted");
+    assert_eq!(inherited.adopted, 3);
+    inherited.removal.await.expect("no panic");
     there(&last).await;
     // What the kernel gives whom nobody gave a weight.
     before[2].1 = Some(100);

@@ -397,7 +397,9 @@ async fn a_daemon_that_comes_after_uses_the_servants_that_are_there() {
     let (_lease, _bus) = robot(&first, "r1").await;
     let servants = shop.world.engine.servants();
     let second = shop.world.daemon();
-    assert_eq!(second.adopt().await.expect("adopted"), 1);
+    let inherited = second.adopt().await.expect("adopted");
+    assert_eq!(inherited.adopted, 1);
+    inherited.removal.await.expect("no panic");
     let (_lease, bus) = robot(&second, "r1").await;
     shop.answers.add_permits(1);
     assert!(call(&bus, "again").await.is_ok());

@@ -14,7 +14,7 @@ mod rollouts;
 /// A machine, and what outlives a daemon on it.
 pub(super) struct World {
     home: tempfile::TempDir,
-    state: Arc<State>,
+    pub(super) state: Arc<State>,
     catalogue: Arc<Catalogue>,
     pub(super) engine: MemoryEngine,
 }
@@ -369,7 +369,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     ended.fail("its node was killed");
     world.engine.leave_behind("half-made");
     let next = world.daemon();
-    assert_eq!(next.adopt().await.expect("it starts"), 1);
+    let inherited = next.adopt().await.expect("it starts");
+    assert_eq!(inherited.adopted, 1);
+    inherited.removal.await.expect("no panic");
     let left = world.told("servant-leftover");
     assert!(left.len() == 1 && left[0].contains("half-made"), "{left:?}");
     let lost = world.told("servant-lost");

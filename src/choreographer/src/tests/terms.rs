@@ -322,7 +322,9 @@ async fn the_terms_of_a_servant_outlive_the_daemon() {
     });
     died.await.expect("no panic");
     let next = world.daemon();
-    assert_eq!(next.adopt().await.expect("adopted"), 1);
+    let inherited = next.adopt().await.expect("adopted");
+    assert_eq!(inherited.adopted, 1);
+    inherited.removal.await.expect("no panic");
     assert_eq!(next.admission().look().1, Amount::new(1.5, 0));
     let lease = ready(&next, stating("r1", &[("cpus", "1.5")])).await;
     assert_eq!(lease.handle().terms().stated_in_words(), "cpus=1.5");

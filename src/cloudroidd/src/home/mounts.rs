@@ -107,7 +107,7 @@ mod tests {
             std::fs::create_dir(&below).expect("made");
             let (kind, no_flags) = (Some("tmpfs"), MsFlags::empty());
             mount(Some("none"), &below, kind, no_flags, None::<&str>).expect("mounted");
-            home.sweep_builds();
+            super::super::sweep_builds(&home.half_made_builds());
             assert!(!build.exists(), "it is swept");
         });
         assert!(hosts.join("theirs").exists(), "the host's files stay");

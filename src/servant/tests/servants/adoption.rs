@@ -118,8 +118,15 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
         1,
         "the shim ends with its servant"
     );
-    let adoption = within(world.restarted().adopt()).await.unwrap();
+    let engine = world.restarted();
+    let adoption = within(engine.adopt()).await.unwrap();
     assert!(adoption.running.is_empty());
+    assert!(
+        world.servant_directory(&id).exists(),
+        "robots wait for no removal"
+    );
+    let failures = within(engine.sweep(&adoption.ended)).await;
+    assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(adoption.ended[0].id, id);
     let Some(ContainerState::Stopped { reason }) = &adoption.ended[0].state else {
@@ -161,7 +168,10 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
         }
     })
     .await;
-    let adoption = within(world.restarted().adopt()).await.unwrap();
+    let engine = world.restarted();
+    let adoption = within(engine.adopt()).await.unwrap();
+    let failures = within(engine.sweep(&adoption.ended)).await;
+    assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(
         adoption
@@ -185,6 +195,7 @@ async fn what_a_daemon_left_half_made_is_removed() {
     .unwrap();
     let adoption = within(world.engine.adopt()).await.unwrap();
     assert_eq!((adoption.ended.len(), adoption.failures.len()), (1, 0));
+    assert!(within(world.engine.sweep(&adoption.ended)).await.is_empty());
     assert!(!world.servant_directory("half").exists());
 }
 
@@ -211,6 +222,7 @@ async fn a_pid_that_now_belongs_to_another_is_left_alone() {
     .unwrap();
     let adoption = within(world.engine.adopt()).await.unwrap();
     assert_eq!(adoption.ended.len(), 1);
+    within(world.engine.sweep(&adoption.ended)).await;
     assert!(bystander.try_wait().unwrap().is_none(), "it still runs");
     drop(bystander.stdin.take());
     bystander.wait().unwrap();

@@ -93,7 +93,7 @@ impl MemoryEngine {
         *self.world.allowed.lock() = grants;
     }
 
-    /// Leaves something of a servant that the next adoption cannot remove.
+    /// Leaves something of a servant that the next sweep cannot remove.
     pub fn leave_behind(&self, id: &str) {
         self.world.leftovers.lock().push(id.to_owned());
     }
@@ -142,12 +142,6 @@ impl Engine for MemoryEngine {
 
     async fn adopt(&self) -> Result<Adopted, Error> {
         let mut adopted = Adopted::default();
-        let left = |id| Error::LeftOver {
-            id,
-            what: "a cgroup".to_owned(),
-        };
-        let leftovers = std::mem::take(&mut *self.world.leftovers.lock());
-        adopted.failures = leftovers.into_iter().map(left).collect();
         let servants: Vec<_> = self.world.servants.lock().values().cloned().collect();
         for servant in servants {
             let state: ContainerState = servant.state().borrow().clone();
@@ -155,13 +149,24 @@ impl Engine for MemoryEngine {
                 adopted.running.push(servant);
                 continue;
             }
-            self.world.forget(servant.id());
             adopted.ended.push(Ended {
                 id: servant.id().to_owned(),
                 state: Some(state),
             });
         }
         Ok(adopted)
+    }
+
+    async fn sweep(&self, ended: &[Ended]) -> Vec<Error> {
+        for ended in ended {
+            self.world.forget(&ended.id);
+        }
+        let left = |id| Error::LeftOver {
+            id,
+            what: "a cgroup".to_owned(),
+        };
+        let leftovers = std::mem::take(&mut *self.world.leftovers.lock());
+        leftovers.into_iter().map(left).collect()
     }
 
     fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {

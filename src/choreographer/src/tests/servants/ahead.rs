@@ -185,7 +185,11 @@ async fn what_a_killed_daemon_kept_ready_ends_without_a_word() {
     died.await.expect("no panic");
     assert_eq!(world.engine.servants().len(), 1);
     let next = world.daemon();
-    assert_eq!(next.adopt().await.expect("it starts"), 0);
+    let inherited = next.adopt().await.expect("it starts");
+    assert_eq!(inherited.adopted, 0);
+    let left = world.engine.servants().len();
+    assert_eq!(left, 1, "robots wait for no removal");
+    inherited.removal.await.expect("no panic");
     assert!(world.engine.servants().is_empty());
     let events = world.state.events(0, 100).expect("events");
     assert!(events.is_empty(), "{events:?}");
