@@ -1,5 +1,7 @@
 //! Limits as the API has them, as the engine takes them, and those that no kernel takes.
 
+use crate::decide::demand;
+
 /// Limits as the API shows them.
 pub(crate) fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
     api::Limits {
@@ -28,10 +30,22 @@ pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
     }
 }
 
-/// Limits that no kernel takes.
+/// Limits that no kernel takes, or that may not be asked for.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct Unusable(String);
+
+/// Refuses a weight that only an operator may give: of more than the cores that these limits promise.
+pub fn check_weight(limits: &api::Limits) -> Result<(), Unusable> {
+    let most = demand::most_weight(limits);
+    match limits.cpu_weight {
+        Some(weight) if weight > most => Err(Unusable(format!(
+            "cpu_weight = {weight} is more than {most}, which is the most here: 1000 for each core asked for with cpus, \
+             100 without; ask for more cores, or have an operator give more by cloudroidctl set"
+        ))),
+        _ => Ok(()),
+    }
+}
 
 /// Refuses limits that no kernel takes.
 pub fn check(limits: &api::Limits) -> Result<(), Unusable> {
@@ -70,4 +84,30 @@ pub fn check(limits: &api::Limits) -> Result<(), Unusable> {
         return refused(format!("pids = {pids} is too few for any node; at least 4"));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_weight_beyond_the_promise_is_refused_with_the_way_to_more() {
+        let asking = |cpus, cpu_weight| api::Limits {
+            cpus,
+            cpu_weight: Some(cpu_weight),
+            ..api::Limits::default()
+        };
+        for (cpus, weight, is_refused) in [
+            (None, 100, false),
+            (None, 101, true),
+            (Some(2.0), 2000, false),
+            (Some(2.0), 2001, true),
+        ] {
+            let outcome = check_weight(&asking(cpus, weight));
+            assert_eq!(outcome.is_err(), is_refused, "{cpus:?} {weight}");
+        }
+        let refused = check_weight(&asking(None, 10_000)).unwrap_err().to_string();
+        assert!(refused.contains("an operator"), "{refused}");
+        assert_eq!(check_weight(&api::Limits::default()), Ok(()));
+    }
 }

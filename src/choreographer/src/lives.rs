@@ -94,8 +94,14 @@ impl Inner {
 
     /// The limits of a servant of this revision where no robot stated anything.
     pub(crate) fn of_push(&self, revision: &RevisionRecord) -> Asked {
+        // Where it cannot be found out whose it is, it is no operator's.
+        let limits = if self.is_deployers(&revision.service).unwrap_or(true) {
+            demand::with_bounded_weight(revision.plan.limits)
+        } else {
+            revision.plan.limits
+        };
         self.asked(api::Terms {
-            limits: revision.plan.limits,
+            limits,
             ..api::Terms::default()
         })
     }
@@ -142,6 +148,7 @@ impl Inner {
         Ok(work(&Offer {
             service: &revision.service,
             limits: revision.plan.limits,
+            is_deployers: self.is_deployers(&revision.service)?,
             caps: revision.plan.caps,
             classes: &options.classes,
             rows: &rows,
@@ -149,6 +156,11 @@ impl Inner {
             reserve: (options.reserve_cpus, options.reserve_memory),
             capacity: self.admission.look().0,
         }))
+    }
+
+    /// Whether a deployer, and no operator, publishes a service.
+    fn is_deployers(&self, service: &str) -> Result<bool, Error> {
+        Ok(self.state.service_owner(service)?.flatten().is_some())
     }
 
     /// What is promised to a servant of these limits.

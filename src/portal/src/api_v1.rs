@@ -356,6 +356,12 @@ pub async fn set_limits(
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
     about.is_set(&format!("servant {id}"), &change);
     choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
+    let moves_cores = change.cpu_weight.is_some() || change.cpus.is_some();
+    if moves_cores && !caller.who.principal.is_unscoped() {
+        let asked = app.choreographer.servant(&id)?.asked_after(change);
+        choreographer::limits::check_weight(&asked)
+            .map_err(|error| Error::BadRequest(error.to_string()))?;
+    }
     app.choreographer.set_limits(&id, change).await?;
     let handle = app.choreographer.servant(&id)?;
     Ok(Json(app.choreographer.describe(&handle).await))

@@ -130,6 +130,10 @@ impl Pusher {
         }
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
+        if by.owner.is_some() {
+            choreographer::limits::check_weight(&options.limits)
+                .map_err(|error| Error::Options(error.to_string()))?;
+        }
         check_caps(options).map_err(Error::Options)?;
         check_sla(options).map_err(Error::Options)?;
         if let Some(terms) = &options.rollout {

@@ -4,6 +4,9 @@ use api::{Limits, Terms};
 
 use super::Amount;
 
+/// The weight of a servant that is promised no cores: the kernel's default.
+const LEAST_WEIGHT: u64 = 100;
+
 /// Limits of a servant, and where they come from.
 #[derive(Debug, Clone)]
 pub struct Asked {
@@ -30,11 +33,30 @@ impl Asked {
 /// Whoever is promised cores gets them before those who are not: a weight of a thousand for each core, where others have
 /// a hundred in all, unless a weight was asked for.
 pub fn with_weight(asked: Limits) -> Limits {
-    let promised = |cpus: f64| ((cpus * 1000.0).round() as u64).clamp(100, 10_000);
     Limits {
-        cpu_weight: asked.cpu_weight.or(asked.cpus.map(promised)),
+        cpu_weight: asked.cpu_weight.or(asked.cpus.map(weight_of)),
         ..asked
     }
+}
+
+/// These limits with no more weight than cores are promised by them: what a deployer asks for may not outweigh what others are
+/// promised.
+pub fn with_bounded_weight(asked: Limits) -> Limits {
+    Limits {
+        cpu_weight: asked
+            .cpu_weight
+            .map(|weight| weight.min(most_weight(&asked))),
+        ..asked
+    }
+}
+
+/// The most weight that these limits may have without an operator's word.
+pub fn most_weight(asked: &Limits) -> u64 {
+    asked.cpus.map_or(LEAST_WEIGHT, weight_of)
+}
+
+fn weight_of(cpus: f64) -> u64 {
+    ((cpus * 1000.0).round() as u64).clamp(LEAST_WEIGHT, 10_000)
 }
 
 /// What of the machine is promised to a servant of these limits: what they say, else of `reserve`, which is cores and
@@ -69,6 +91,25 @@ mod tests {
             (None, Some(7), Some(7)),
         ] {
             assert_eq!(weight(cpus, asked), gets, "{cpus:?} {asked:?}");
+        }
+    }
+
+    #[test]
+    fn a_bounded_weight_is_what_its_cores_weigh_at_most() {
+        for (cpus, asked, gets) in [
+            (None, None, None),
+            (None, Some(7), Some(7)),
+            (None, Some(10_000), Some(100)),
+            (Some(1.5), Some(10_000), Some(1500)),
+            (Some(1.5), Some(7), Some(7)),
+            (Some(1.5), None, None),
+        ] {
+            let asked = Limits {
+                cpus,
+                cpu_weight: asked,
+                ..Limits::default()
+            };
+            assert_eq!(with_bounded_weight(asked).cpu_weight, gets, "{asked:?}");
         }
     }
 

@@ -24,6 +24,7 @@ use api::sla::Goal;
 use api::{Caps, Limits, Sla, Stated, Terms};
 
 use super::Amount;
+use super::demand::with_bounded_weight;
 use super::dictionary::{Aux, Choice, Shelf};
 use crate::options::{Class, DEFAULT_CLASS};
 use caps::Bounds;
@@ -37,6 +38,8 @@ pub struct Offer<'a> {
     pub service: &'a str,
     /// Limits that its push asked for.
     pub limits: Limits,
+    /// A deployer owns it: the weight that its push and its rows ask for is at most what is promised.
+    pub is_deployers: bool,
     /// What its robots may ask for.
     pub caps: Caps,
     /// All classes, by name.
@@ -216,13 +219,22 @@ pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Ter
         let measured = pairs_of(&reading.measured);
         why.push(format!("its messages were measured: {measured}"));
     }
+    let limits = direct.or(by_rows.unwrap_or(own));
+    // The weight of a class is an operator's.
+    let asks = |limits: &Limits| limits.cpu_weight.is_some();
+    let by_deployer = asks(&offer.limits) || rows.iter().any(|row| asks(&row.limits));
+    let limits = if offer.is_deployers && by_deployer {
+        with_bounded_weight(limits)
+    } else {
+        limits
+    };
     Ok(Terms {
         stated: stated.clone(),
         measured: offer.measured.clone(),
         class: reading.class.map(|(name, _)| name.to_owned()),
         priority: reading.class.map_or(0, |(_, class)| class.priority),
         rows,
-        limits: direct.or(by_rows.unwrap_or(own)),
+        limits,
         why,
     })
 }

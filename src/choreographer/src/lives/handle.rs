@@ -182,6 +182,15 @@ impl Handle {
         self.asked.lock().promised()
     }
 
+    /// Those that would be promised to it after this change, with no weight but one that somebody set.
+    pub fn asked_after(&self, change: Limits) -> Limits {
+        let asked = self.asked.lock();
+        Limits {
+            cpu_weight: change.cpu_weight.or(asked.set.cpu_weight),
+            ..change.or(asked.promised())
+        }
+    }
+
     /// What its robot stated, and what follows.
     pub fn terms(&self) -> Terms {
         self.asked.lock().terms.clone()

@@ -48,6 +48,24 @@ async fn a_robot_gets_and_is_promised_what_it_states() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_deployers_service_weighs_what_it_is_promised_and_an_operators_what_it_asks_for() {
+    let world = World::new();
+    for name in ["greet", "greedy"] {
+        world.publish(name, "/greet", |record| {
+            record.plan.limits.cpu_weight = Some(10_000);
+        });
+    }
+    world.state.own_service("greedy", "ann").expect("an owner");
+    let daemon = world.daemon();
+    for (service, weight) in [("greet", 10_000), ("greedy", 100)] {
+        let lease = ready(&daemon, ServantRequest::new(service, "r1")).await;
+        let shown = daemon.describe(lease.handle()).await;
+        let limits = shown.enforced.expect("it runs");
+        assert_eq!(limits.cpu_weight, Some(weight), "{service}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn who_states_something_else_is_resized_in_place_or_told_what_would_fit() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});

@@ -39,6 +39,7 @@ fn offer(classes: &BTreeMap<String, Class>) -> Offer<'_> {
             cpus: Some(2.0),
             ..Limits::default()
         },
+        is_deployers: false,
         caps: Caps {
             cpus: Some(3.0),
             memory: None,
@@ -356,4 +357,53 @@ fn an_explanation_says_of_each_row_why() {
     assert!(refused.refused.is_some_and(|why| why.contains("rrt 10ms")));
     let unknown = one(&[("class", "nope")]);
     assert!(unknown.refused.is_some_and(|why| why.contains("nope")));
+}
+
+#[test]
+fn what_a_deployer_asks_for_outweighs_no_promise_and_what_an_operator_says_may() {
+    let (some, none) = (classes(), BTreeMap::new());
+    let heavy = Limits {
+        cpu_weight: Some(10_000),
+        ..Limits::default()
+    };
+    let promised = Limits {
+        cpus: Some(2.0),
+        ..heavy
+    };
+    let mut by_row = row(1, Measure::Rrt, 0.05, 1.0, None);
+    by_row.limits.cpu_weight = Some(10_000);
+    let rows = [by_row];
+    let rrt = &[("rrt", "50ms")][..];
+    let (of_nobody, unweighed) = (&[][..], Limits::default());
+    // (push, rows, classes, stated, a deployer's, an operator's)
+    for (limits, rows, classes, query, deployers, operators) in [
+        (heavy, of_nobody, &none, &[][..], 100, 10_000),
+        (promised, of_nobody, &none, &[], 2000, 10_000),
+        // Of the cores that it has in the end, not of those of the push.
+        (promised, of_nobody, &none, &[("cpus", "0.5")], 500, 10_000),
+        (unweighed, &rows, &none, rrt, 1000, 10_000),
+        (heavy, of_nobody, &some, &[("class", "urgent")], 500, 10_000),
+        // The class's own, which is the operator's.
+        (
+            unweighed,
+            of_nobody,
+            &some,
+            &[("class", "urgent")],
+            500,
+            500,
+        ),
+    ] {
+        let weight = |is_deployers| {
+            let offer = Offer {
+                limits,
+                rows,
+                is_deployers,
+                ..offer(classes)
+            };
+            let terms = terms(&stated(query), &offer).expect("tenable");
+            terms.limits.cpu_weight
+        };
+        let got = (weight(true), weight(false));
+        assert_eq!(got, (Some(deployers), Some(operators)), "{query:?}");
+    }
 }
