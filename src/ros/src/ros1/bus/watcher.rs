@@ -25,6 +25,23 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// A Master may be silent so long before it is told: one that ends takes its bus with it, a moment later.
 const SILENCE: Duration = Duration::from_secs(3);
 
+/// A graph is read, compared and shown as a whole. A node that changes a large one again and again would have us do little else; so
+/// there is a rest for each of its parts before the next look, many times as long as it took, and at most so long.
+const REST: Duration = Duration::from_micros(25);
+const LONGEST_REST: Duration = Duration::from_secs(1);
+
+/// How long to rest after a look at this graph.
+fn rest(graph: &Graph) -> Duration {
+    let ends = |nodes: &TopicNodes| nodes.publishers.len() + nodes.subscribers.len();
+    let parts = graph.topics.values().map(ends).sum::<usize>()
+        + graph.services.len()
+        + graph.nodes.len()
+        + graph.parameters.len()
+        + graph.sought.len();
+    let parts = u32::try_from(parts).unwrap_or(u32::MAX);
+    REST.saturating_mul(parts).min(LONGEST_REST)
+}
+
 /// Since when the Master has not answered, and whether that was told.
 #[derive(Default)]
 struct Silence {
@@ -84,9 +101,10 @@ impl Watcher {
                 sleep(PERIOD).await;
             }
             match self.look().await {
-                Ok(()) => {
+                Ok(rest) => {
                     pause = PAUSE;
                     silence = Silence::default();
+                    sleep(rest).await;
                 }
                 Err(error) => {
                     silence.goes_on(&error);
@@ -100,7 +118,8 @@ impl Watcher {
         }
     }
 
-    async fn look(&mut self) -> Result<(), xmlrpc::Error> {
+    /// Looks at the graph; how long to rest before the next look.
+    async fn look(&mut self) -> Result<Duration, xmlrpc::Error> {
         let first = self.known == -1;
         let graph = if self.waits {
             match wait(&self.bus, self.known, POLL).await {
@@ -125,8 +144,9 @@ impl Watcher {
             // It may be another Master than the one that was told.
             let _ = self.bus.report_that_it_lends().await;
         }
+        let rest = rest(&graph);
         self.take(graph).await;
-        Ok(())
+        Ok(rest)
     }
 
     /// Brings everything in line with the graph, then shows it.

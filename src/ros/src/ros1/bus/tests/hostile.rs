@@ -206,3 +206,35 @@ async fn the_slave_api_answers_what_tools_ask() {
     assert_eq!(reason.as_deref(), Some("enough"));
     assert_eq!(ask("getPid", &caller).await[0], 1.into());
 }
+
+#[tokio::test]
+async fn a_graph_that_grows_without_end_is_read_seldom() {
+    const REGISTRATIONS: usize = 3000;
+    let master = TestMaster::start().await;
+    let bus = join(&master, "/one").await;
+    let mut graph = bus.graph();
+    let reading = tokio::spawn(async move {
+        let mut read = 0;
+        loop {
+            let topics = graph.borrow_and_update().topics.len();
+            read += topics;
+            if topics >= REGISTRATIONS {
+                return read;
+            }
+            graph.changed().await.unwrap();
+        }
+    });
+    for number in 0..REGISTRATIONS {
+        let topic = format!("/topic{number}");
+        let list = ["/greedy", &topic, "std_msgs/String", "http://127.0.0.1:9/"];
+        master
+            .call("registerPublisher", &list.map(Value::from))
+            .await;
+    }
+    // Were it read for each of them, it would be a thousand of its parts for each, on the average.
+    let read = reading.await.unwrap() / REGISTRATIONS;
+    assert!(
+        read < REGISTRATIONS / 10,
+        "{read} topics for each registration"
+    );
+}
