@@ -166,7 +166,7 @@ impl Kills {
         );
         report
             .figure(
-                format!("from the end of a {victim} to the next answer"),
+                format!("from kill -9 of the {victim} to the next answer"),
                 "ms",
                 median(&self.again),
             )
