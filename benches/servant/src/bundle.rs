@@ -37,6 +37,7 @@ impl Bundle {
         let staged = Staged {
             root: root.path().to_owned(),
             volumes: Vec::new(),
+            user_namespace: fs::File::open("/proc/self/ns/user")?.into(),
         };
         // Two containers may have the same ids; no servant runs meanwhile.
         let mut config = configuration(spec, &staged, (DEFAULT_UID_BASE, uids::RANGE))?;
@@ -65,7 +66,6 @@ pub(crate) fn configuration(
     let mut config = serde_json::to_value(servant::bundle::config(
         spec,
         staged,
-        uid_range,
         &servant::quotas::Quotas::default(),
     )?)?;
     config["process"]["args"] = json!(PROGRAM);
@@ -74,5 +74,15 @@ pub(crate) fn configuration(
         .as_array_mut()
         .context("namespaces")?;
     namespaces.push(json!({ "type": "network" }));
+    // Ours is made before the container, with limits of what the kernel counts by user; peers make it by its maps.
+    namespaces.retain(|namespace| namespace["type"] != "user");
+    namespaces.push(json!({ "type": "user" }));
+    let (first, count) = uid_range;
+    let map = json!([{ "containerID": 0, "hostID": first, "size": count }]);
+    config["linux"]["uidMappings"] = map.clone();
+    config["linux"]["gidMappings"] = map;
+    if let Some(linux) = config["linux"].as_object_mut() {
+        linux.remove("sysctl");
+    }
     Ok(config)
 }

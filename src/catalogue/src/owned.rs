@@ -76,16 +76,18 @@ mod tests {
             let bytes = catalogue.bytes_of(owner, image).await;
             bytes.expect("counted")
         };
-        assert_eq!(taken("ann", None).await, 0);
-        for service in ["one", "two"] {
+        for (service, owner) in [
+            ("nobodys", None),
+            ("two", Some("ben")),
+            ("one", Some("ann")),
+        ] {
+            assert_eq!(taken("ann", None).await, 0, "{service} is another's");
             let mut record = revision.clone();
             record.service = service.to_owned();
+            record.owner = owner.map(str::to_owned);
             let published = catalogue.publish(record, Inventory::default()).await;
             published.expect("published");
         }
-        assert_eq!(taken("ann", None).await, 0, "they are nobody's");
-        catalogue.own("one", "ann").expect("written");
-        catalogue.own("two", "ben").expect("written");
         assert_eq!(taken("ann", None).await, shared.size);
         assert_eq!(taken("ann", Some(&other)).await, shared.size + own.size);
         // Revisions before the current one count, too.

@@ -50,12 +50,12 @@ async fn a_robot_gets_and_is_promised_what_it_states() {
 #[tokio::test(start_paused = true)]
 async fn a_deployers_service_weighs_what_it_is_promised_and_an_operators_what_it_asks_for() {
     let world = World::new();
-    for name in ["greet", "greedy"] {
+    for (name, owner) in [("greet", None), ("greedy", Some("ann".to_owned()))] {
         world.publish(name, "/greet", |record| {
             record.plan.limits.cpu_weight = Some(10_000);
+            record.owner = owner;
         });
     }
-    world.state.own_service("greedy", "ann").expect("an owner");
     let daemon = world.daemon();
     for (service, weight) in [("greet", 10_000), ("greedy", 100)] {
         let lease = ready(&daemon, ServantRequest::new(service, "r1")).await;
