@@ -91,11 +91,11 @@ impl Evaluation {
 }
 
 /// Where the daemon is: beside the evaluation, as cargo builds them.
+/// Where the programs are that are built for all tests, the robot's among them.
 fn binaries() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_eval"))
-        .parent()
-        .expect("a directory")
-        .to_owned()
+    let beside = Path::new(env!("CARGO_BIN_EXE_eval")).parent();
+    std::env::var_os("CLOUDROID_BIN")
+        .map_or_else(|| beside.expect("a directory").to_owned(), PathBuf::from)
 }
 
 fn directories() -> (tempfile::TempDir, PathBuf, PathBuf) {

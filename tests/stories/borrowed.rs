@@ -116,7 +116,7 @@ pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
                  catkin_package()\n\
                  catkin_install_python(PROGRAMS counts.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
     let needs = "<buildtool_depend>catkin</buildtool_depend><exec_depend>rospy</exec_depend>";
-    let program = "#!/usr/bin/env python3\nimport rospy\nimport numpy\nrospy.init_node('counts')\nrospy.spin()\n";
+    let program = "#!/usr/bin/env python3\nimport rospy\nimport scipy\nrospy.init_node('counts')\nrospy.spin()\n";
     write(
         place.path(),
         &[
@@ -126,7 +126,7 @@ pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
         ],
     )?;
     let push = ["push", path_str(place.path())];
-    let missing = "the Python module numpy is missing: push with `--with python3-numpy`";
+    let missing = "the Python module scipy is missing: push with `--with python3-scipy`";
     daemon
         .deployer()
         .types(&push)?

@@ -460,7 +460,7 @@ pub fn what_a_full_disk_refuses_is_not_done() -> Verdict {
             name,
             "--role",
             "viewer",
-            "--services",
+            "--service",
             "*",
         ]
     };

@@ -103,6 +103,32 @@ fn the_map_says_what_the_manifests_say() {
     assert!(untold.is_empty(), "the map has no row for {untold:?}");
 }
 
+/// Whether a cell names unit tests, "`one`, `two` (crate `of_these`)", all of which there are.
+fn is_tested(cell: &str) -> bool {
+    let crates = members();
+    let mut parts = cell.split("(crate `");
+    let mut before = parts.next().unwrap_or_default();
+    let mut found = false;
+    for part in parts {
+        let (name, after) = part.split_once("`)").expect(cell);
+        let directory = crates.iter().find(|(_, of_it)| *of_it == name);
+        let (directory, _) = directory.expect(cell);
+        let mut files = Vec::new();
+        sources(&root().join(directory), &mut files);
+        let text = files
+            .iter()
+            .map(|file| std::fs::read_to_string(file).expect("text"));
+        let text: String = text.collect();
+        for test in before.split('`').skip(1).step_by(2) {
+            let is_there = test.contains("::") || text.contains(&format!("fn {test}("));
+            assert!(is_there, "the crate {name} has no test {test}");
+            found = true;
+        }
+        before = after;
+    }
+    found
+}
+
 #[test]
 fn the_stories_that_security_rests_on_exist() {
     let document = std::fs::read_to_string(root().join("docs/security.md")).expect("it is there");
@@ -117,7 +143,9 @@ fn the_stories_that_security_rests_on_exist() {
             .split('`')
             .filter(|text| text.contains("::"))
             .collect();
-        assert!(!stories.is_empty(), "no story shows: {row}");
+        // A bound that one crate keeps is shown by a test of that crate.
+        let tested = is_tested(cells[3]);
+        assert!(!stories.is_empty() || tested, "nothing shows: {row}");
         for story in stories {
             let (module, name) = story.split_once("::").expect("a module");
             let of_module = registered.split_once(&format!("stories![{module}:"));

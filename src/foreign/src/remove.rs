@@ -4,7 +4,7 @@
 //! nested directories overflow a thread's stack, which ends the process. Here the way back to the parent is `..`, checked
 //! against the directory from which it was entered, so each level costs some bytes of the heap.
 
-use std::ffi::CString;
+use std::ffi::{CStr, CString};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 
@@ -83,14 +83,14 @@ impl Remover<'_> {
                 return Ok(());
             };
             let up = rustix::fs::openat(&at, c"..", DIRECTORY, Mode::empty())
-                .map_err(|error| self.failed("leave", &stack, &level.name, error))?;
+                .map_err(|error| self.failed("leave", &stack, &[&level.name], error))?;
             if identity(&self.stat(&up, &stack)?) != level.above {
-                return Err(self.failed("leave", &stack, &level.name, Errno::STALE));
+                return Err(self.failed("leave", &stack, &[&level.name], Errno::STALE));
             }
             at = up;
             match rustix::fs::unlinkat(&at, &level.name, AtFlags::REMOVEDIR) {
                 Ok(()) | Err(Errno::NOENT) => {}
-                Err(error) => return Err(self.failed("remove", &stack, &level.name, error)),
+                Err(error) => return Err(self.failed("remove", &stack, &[&level.name], error)),
             }
         }
     }
@@ -103,7 +103,7 @@ impl Remover<'_> {
         name: &CString,
         stack: &[Level],
     ) -> Result<Option<(OwnedFd, Vec<CString>)>, Error> {
-        let failed = |action, error| self.failed(action, stack, name, error);
+        let failed = |action, error| self.failed(action, stack, &[name], error);
         match rustix::fs::statat(at, name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) if FileType::from_raw_mode(stat.st_mode) == FileType::Directory => {}
             Ok(_) => {
@@ -140,7 +140,7 @@ impl Remover<'_> {
                 Ok(()) | Err(Errno::NOENT) => {}
                 // What Linux says of a directory, and what POSIX does.
                 Err(Errno::ISDIR | Errno::PERM) => left.push(entry),
-                Err(error) => return Err(self.failed("remove", stack, &entry, error)),
+                Err(error) => return Err(self.failed("remove", stack, &[name, &entry], error)),
             }
         }
         // Removing a directory needs the right to write the one it is in.
@@ -151,20 +151,22 @@ impl Remover<'_> {
     }
 
     fn stat(&self, directory: &OwnedFd, stack: &[Level]) -> Result<Stat, Error> {
-        rustix::fs::fstat(directory).map_err(|error| self.failed("look at", stack, c".", error))
+        rustix::fs::fstat(directory).map_err(|error| self.failed("look at", stack, &[c"."], error))
     }
 
+    /// The error of a system call about what has these names, one in another, below the directories of the stack.
     fn failed(
         &self,
         action: &'static str,
         stack: &[Level],
-        name: &std::ffi::CStr,
+        names: &[&CStr],
         error: Errno,
     ) -> Error {
         use std::os::unix::ffi::OsStrExt;
         let mut path = PathBuf::from(self.root);
-        let shown = stack.iter().skip(1).map(|level| level.name.as_c_str());
-        for name in shown.chain(if stack.is_empty() { None } else { Some(name) }) {
+        let above = stack.iter().map(|level| level.name.as_c_str());
+        // The first name is the root's own.
+        for name in above.chain(names.iter().copied()).skip(1) {
             path.push(std::ffi::OsStr::from_bytes(name.to_bytes()));
         }
         match error {

@@ -164,28 +164,27 @@ async fn parameters_of_a_hello_count_until_they_are_set() {
 
 #[tokio::test]
 async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
-    let options = HubOptions {
-        budget: Budget::new("robot x", 4 << 20),
-        ..HubOptions::default()
-    };
-    let (hub, nodes) = hub_with(options).await;
     let mut long = hello("/detect", 1);
     long.parameters = many_parameters();
     let mut wordy = hello("/detect", 1);
     wordy.host = "x".repeat(MAX_CONTROL);
-    for (hello, words) in [
-        (long, "do not fit into the memory for robot x"),
-        (wordy, "a hello without parameters of 10485"),
+    for (room, hello, words) in [
+        (4 << 20, long, "do not fit into the memory for robot x"),
+        (64 << 20, wordy, "a hello without parameters of 10485"),
     ] {
+        let options = HubOptions {
+            budget: Budget::new("robot x", room),
+            ..HubOptions::default()
+        };
+        let (hub, nodes) = hub_with(options).await;
         let (robot, cloud) = duplex(1 << 16);
-        let hub = Arc::clone(&hub);
         tokio::spawn(async move { hub.serve(cloud, b"").await });
         let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
         send_open(&mut socket, &hello).await.unwrap();
         let reason = closed(socket).await;
         assert!(reason.contains(words), "{reason}");
+        assert!(nodes.running.lock().is_empty());
     }
-    assert!(nodes.running.lock().is_empty());
 }
 
 #[tokio::test]
