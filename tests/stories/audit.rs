@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
-use support::patience::Patient;
+use support::patience::{self, Patient};
 use support::robot::Robot;
 use support::world::world;
 use support::{Verdict, binaries};
@@ -42,10 +42,16 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .spawn()?;
-    let mut followed = BufReader::new(follower.stdout.take().context("piped")?).lines();
-    let mut hears = |word: &str| -> Verdict {
+    let followed = BufReader::new(follower.stdout.take().context("piped")?).lines();
+    let (sender, lines) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        followed
+            .map_while(Result::ok)
+            .try_for_each(|line| sender.send(line))
+    });
+    let hears = |word: &str| -> Verdict {
         loop {
-            let line = followed.next().context("the log ended")??;
+            let line = patience::receive(&lines).with_context(|| format!("{word} was not told"))?;
             if line.contains(word) {
                 return Ok(());
             }
@@ -61,7 +67,7 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
         &daemon,
         &[&["alice", "--role", "deployer"], &scope[..]].concat(),
     )?;
-    hears("token alice (deployer)")?;
+    hears("token alice: ")?;
     let eve = token(
         &daemon,
         &[&["eve", "--role", "viewer"], &scope[..]].concat(),
@@ -92,7 +98,10 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
         &records,
         &[
             ("who", root.clone()),
-            ("object", json!("token alice (deployer)")),
+            (
+                "object",
+                json!(r#"token alice: {"name":"alice","role":"deployer","services":["adder*"]}"#),
+            ),
         ],
     )?;
     ensure!(

@@ -52,7 +52,7 @@ pub async fn create(
     body: Body,
 ) -> Answer<Secret> {
     let new: NewToken = read(&app, &caller, body, "token").await?;
-    about.is_set("token", &new);
+    about.is_set(&format!("token {}", new.name), &new);
     let first = app.principals.names_nobody();
     let made = app.principals.create(&new)?;
     if first {
