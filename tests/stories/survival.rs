@@ -472,7 +472,6 @@ pub fn what_a_full_disk_refuses_is_not_done() -> Verdict {
         &["token", "rotate", "ada"],
         &["token", "revoke", "ada"],
         &["policy", "allow", "ada", "call:/x"],
-        &["pair", "rover", "--services", "*"],
     ] {
         deployer.types(refused)?.failed_saying(&["full"])?;
     }

@@ -113,7 +113,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
                 app.audit
                     .record_sparingly(&nobody, Action::Enter, &did, &object, status);
             }
-            if oci::is_registrys(request.uri().path()) {
+            if oci::is_of_registry_client(request.uri().path(), request.headers()) {
                 oci::not_let_in(&error)
             } else {
                 error.into_response()

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
-use axum::http::{HeaderName, HeaderValue, Method, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde_json::json;
@@ -26,6 +26,14 @@ const CHALLENGE: HeaderValue =
 /// Whether an address is the registry's.
 pub fn is_registrys(path: &str) -> bool {
     path == "/v2" || path.starts_with("/v2/")
+}
+
+/// Whether a request is one of a client of registries, which has to be asked for a password in its words. A browser would show such a
+/// challenge to whoever sits before it, as a dialog that any page can bring up; all browsers call themselves Mozilla (RFC 9110, section 10.1.5).
+pub fn is_of_registry_client(path: &str, headers: &HeaderMap) -> bool {
+    let agent = headers.get(header::USER_AGENT);
+    let is_browser = agent.is_some_and(|agent| agent.as_bytes().starts_with(b"Mozilla/"));
+    is_registrys(path) && !is_browser
 }
 
 /// `/v2/`: yes, this is a registry.
@@ -207,6 +215,18 @@ fn refused(status: StatusCode, code: &str, message: &str) -> Response {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn browsers_are_not_asked_for_a_password() {
+        let of = |path, agent: &'static str| {
+            let agent = (header::USER_AGENT, HeaderValue::from_static(agent));
+            is_of_registry_client(path, &HeaderMap::from_iter([agent]))
+        };
+        assert!(of("/v2/", "skopeo/1.9.3"));
+        assert!(is_of_registry_client("/v2/_catalog", &HeaderMap::new()));
+        assert!(!of("/v2/_catalog", "Mozilla/5.0 (X11; Linux x86_64)"));
+        assert!(!of("/api/v1/services", "skopeo/1.9.3"));
+    }
 
     #[tokio::test]
     async fn clients_of_registries_are_asked_for_a_password_in_their_words() {
