@@ -9,7 +9,7 @@ import time
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -51,6 +51,15 @@ class Peer(Node):
 
     def publishers_of(self, topic):
         return [[self.full(info), info.topic_type, str(info.topic_type_hash)] for info in self.get_publishers_info_by_topic(topic)]
+
+    def servers_of(self, service):
+        return [sorted(f'{space.rstrip("/")}/{name}' for name, space in self.get_node_names_and_namespaces() if service in self.services_of(name, space))]
+
+    def services_of(self, name, space):
+        try:
+            return dict(self.get_service_names_and_types_by_node(name, space))
+        except NodeNameNonExistentError:
+            return {}
 
     def full(self, info):
         return info.node_namespace.rstrip('/') + '/' + info.node_name

@@ -255,10 +255,11 @@ impl Shared {
         Some(self.ends.get()?.goal.matched())
     }
 
-    /// Whether somebody takes goals here who also sends results. Who only observes goals does not.
+    /// Whether somebody takes goals here who also sends results. Who only observes goals does not, and a server that is on its way
+    /// in or out, registered for one of both, does not either: it has no type yet, or no longer.
     fn has_server(&self, matched: &Matched, graph: &Graph) -> bool {
-        let results = graph.topics.get(&format!("{}/result", self.name));
-        results.is_some_and(|ends| ends.publishers.iter().any(|node| matched.has_node(node)))
+        let nodes = graph.actions.get(&self.name);
+        nodes.is_some_and(|nodes| nodes.servers.iter().any(|node| matched.has_node(node)))
     }
 
     fn is_connected(&self) -> bool {
@@ -295,7 +296,8 @@ impl Shared {
                 let servers = graph.topics.get(&topic).map(|nodes| &nodes.subscribers);
                 let mut others = servers.into_iter().flatten();
                 let others = others.all(|node| *node == self.bus.node || matched.has_node(node));
-                others && self.has_server(&matched, &graph)
+                let has_other_type = graph.other_action(&self.name, &self.type_name).is_some();
+                others && !has_other_type && self.has_server(&matched, &graph)
             };
             if complete {
                 return;
