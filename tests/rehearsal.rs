@@ -8,8 +8,14 @@ use support::{Verdict, story};
 
 use crate::runner::Story;
 
-/// The variable that asks for them.
+/// The variable that asks for them; its value is the time after which one of them has no end, in seconds.
 pub const VARIABLE: &str = "CLOUDROID_REHEARSAL";
+
+/// Returns that time, if they are asked for.
+pub fn limit() -> Option<Duration> {
+    let seconds = std::env::var(VARIABLE).ok()?;
+    Some(Duration::from_secs(seconds.parse().unwrap_or(1200)))
+}
 
 /// All of them.
 pub fn stories() -> Vec<Story> {
@@ -21,6 +27,11 @@ pub fn stories() -> Vec<Story> {
         crate::story("rehearsal::is_missed_once", fail_once),
         crate::story("rehearsal::times_out_once", fail_once),
         crate::story("rehearsal::waits", wait_with_a_servant),
+        crate::story("rehearsal::has_no_end", || {
+            loop {
+                std::thread::sleep(Duration::from_secs(3600));
+            }
+        }),
     ]
 }
 

@@ -10,6 +10,7 @@
 mod machine;
 mod record;
 mod report;
+mod watchdog;
 
 use std::collections::VecDeque;
 use std::num::NonZero;
@@ -25,6 +26,7 @@ use support::{Verdict, binaries, claim, evidence};
 
 use record::Record;
 use report::Report;
+use watchdog::Watchdog;
 
 /// Stories told at a time for each core: most of a story is waiting. What compiles waits for a core besides (`support::cores`).
 const AT_A_TIME: usize = 4;
@@ -82,8 +84,9 @@ struct Outcome {
     failure: Option<String>,
 }
 
-/// Tells those of `stories` that the arguments name; `alone` lists those that compare times with each other, which are told while no other is.
-pub fn run(stories: Vec<Story>, alone: &[&str]) -> ExitCode {
+/// Tells those of `stories` that the arguments name; `alone` lists those that compare times with each other, which are told while no other is. A
+/// story that takes longer than `limit` ends the run with a failure.
+pub fn run(stories: Vec<Story>, alone: &[&str], limit: Duration) -> ExitCode {
     let arguments = Arguments::parse();
     let stories: Vec<Story> = stories
         .into_iter()
@@ -112,6 +115,7 @@ pub fn run(stories: Vec<Story>, alone: &[&str]) -> ExitCode {
     let runner = Runner {
         is_strict,
         outcomes: Mutex::default(),
+        watchdog: Watchdog::start(limit),
     };
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     let at_a_time = arguments
@@ -143,6 +147,7 @@ pub fn run(stories: Vec<Story>, alone: &[&str]) -> ExitCode {
 struct Runner {
     is_strict: bool,
     outcomes: Mutex<Vec<Outcome>>,
+    watchdog: Watchdog,
 }
 
 impl Runner {
@@ -152,7 +157,7 @@ impl Runner {
             for _ in 0..at_a_time {
                 scope.spawn(|| {
                     while let Some(story) = self.next(&pending) {
-                        let outcome = tell(story, 1);
+                        let outcome = self.tell(story, 1);
                         self.outcomes().push(outcome);
                     }
                 });
@@ -185,8 +190,15 @@ impl Runner {
         stories
             .iter()
             .filter(|story| failed.contains(&story.name))
-            .map(|story| tell(story, 2))
+            .map(|story| self.tell(story, 2))
             .collect()
+    }
+
+    fn tell(&self, story: &Story, attempt: usize) -> Outcome {
+        self.watchdog.begin(story.name);
+        let outcome = tell(story, attempt);
+        self.watchdog.end(story.name);
+        outcome
     }
 
     fn failed(&self) -> usize {

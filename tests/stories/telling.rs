@@ -17,7 +17,7 @@ fn rehearse(place: &Directory, names: &[&str]) -> anyhow::Result<Command> {
     let mut command = Command::new(std::env::current_exe()?);
     command
         .args(names)
-        .env(rehearsal::VARIABLE, "1")
+        .env(rehearsal::VARIABLE, "1200")
         .env("CLOUDROID_TARGET", place.path().join("target"))
         .env("TMPDIR", place.path())
         .env_remove("STRICT");
@@ -120,6 +120,17 @@ pub fn more_than_two_by_chance_fail_the_run_and_strictly_the_first() -> Verdict 
         "1 passed, 1 failed",
     ])?;
     run(&mut rehearse(&place, &["nobody"])?)?.failed_saying(&["no story is called nobody"])?;
+    Ok(())
+}
+
+pub fn one_without_an_end_is_named_and_ends_the_run() -> Verdict {
+    let place = world().directory("telling")?;
+    let names = ["rehearsal::passes", "rehearsal::has_no_end"];
+    let outcome = run(rehearse(&place, &names)?.env(rehearsal::VARIABLE, "2"))?;
+    outcome.failed_saying(&[
+        "test rehearsal::passes ... ok",
+        "== failed: rehearsal::has_no_end has no end",
+    ])?;
     Ok(())
 }
 
