@@ -285,6 +285,7 @@ fn main() -> ExitCode {
             roslib_finds_nothing_missing,
             roslibrust_finds_nothing_missing,
             clients_with_tokens_find_nothing_missing,
+            what_a_node_that_is_well_prints_is_in_its_log_at_once,
         ],
         stories![clients_of_ros2: they_find_nothing_missing],
         stories![house:

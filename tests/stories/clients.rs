@@ -48,6 +48,21 @@ pub fn clients_with_tokens_find_nothing_missing() -> Verdict {
     Ok(())
 }
 
+pub fn what_a_node_that_is_well_prints_is_in_its_log_at_once() -> Verdict {
+    let daemon = world().with(FIXTURE)?;
+    let _robot = daemon.robot(&format!("{}?robot=reader", FIXTURE.name))?;
+    let id = daemon.servant_of(FIXTURE.name, "reader")?["id"].clone();
+    let id = id.as_str().context("an id")?;
+    support::until("a line of ROS_INFO", || {
+        let log = daemon.deployer().types(&["logs", id])?.succeeded()?;
+        Ok(if log.stdout.contains("the fixture is ready") {
+            Ok(())
+        } else {
+            Err(log.said())
+        })
+    })
+}
+
 /// Where its sources are.
 fn package_of(service: Service) -> anyhow::Result<String> {
     let package = binaries::package(service.package.context("a package of the repository")?);

@@ -65,12 +65,12 @@ impl Remover<'_> {
         let mut at = parent;
         let mut next = Some(name);
         loop {
-            if let Some(name) = next.take()
-                && let Some((directory, left)) = self.enter(&at, &name, &stack)?
-            {
-                let above = identity(&self.stat(&at, &stack)?);
-                at = directory;
-                stack.push(Level { name, above, left });
+            if let Some(name) = next.take() {
+                if let Some((directory, left)) = self.enter(&at, &name, &stack)? {
+                    let above = identity(&self.stat(&at, &stack)?);
+                    at = directory;
+                    stack.push(Level { name, above, left });
+                }
             }
             let Some(level) = stack.last_mut() else {
                 return Ok(());

@@ -18,7 +18,7 @@ pub fn escape(text: &str, colours: bool) -> Cow<'_, str> {
     let mut coloured = false;
     let mut rest = text;
     while let Some(c) = rest.chars().next() {
-        if colours && let Some(colour) = colour(rest) {
+        if let Some(colour) = colour(rest).filter(|_| colours) {
             out.push_str(colour);
             coloured = true;
             rest = &rest[colour.len()..];

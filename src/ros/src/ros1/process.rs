@@ -23,6 +23,9 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
             format!("http://localhost:{}", MASTER.port()),
         ),
         ("ROS_HOSTNAME", "localhost".to_owned()),
+        // A node's output is a pipe: without these its lines come when a buffer is full, and the last ones of a node that crashes never.
+        ("ROSCONSOLE_STDOUT_LINE_BUFFERED", "1".to_owned()),
+        ("PYTHONUNBUFFERED", "1".to_owned()),
     ]
     .map(|(name, value)| (name.to_owned(), value))
     .into()
@@ -66,6 +69,14 @@ mod tests {
             assert_eq!(identity.arguments, [argument], "{node}");
             let variable = ("ROS_NAMESPACE".to_owned(), namespace.to_owned());
             assert_eq!(identity.environment, [variable].into(), "{node}");
+        }
+    }
+
+    #[test]
+    fn what_a_node_prints_is_there_at_once() {
+        let environment = environment("/root");
+        for name in ["ROSCONSOLE_STDOUT_LINE_BUFFERED", "PYTHONUNBUFFERED"] {
+            assert_eq!(environment[name], "1");
         }
     }
 
