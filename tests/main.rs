@@ -433,6 +433,7 @@ fn main() -> ExitCode {
             what_response_times_cost_is_measured_from_the_page,
             it_is_told_at_once_that_a_token_was_revoked,
             what_flows_inside_a_servant_is_drawn_and_changed,
+            a_servant_of_ros_2_is_looked_into,
             settings_of_a_node_are_changed_inside,
             a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing,
         ],

@@ -11,7 +11,7 @@ use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::machine::Machine;
 use support::patience::tell_patience;
-use support::world::{ADDER, PEOPLE, TELLER, world};
+use support::world::{ADDER, PEOPLE, SIGHTS_TWO, TELLER, world};
 use support::{Verdict, binaries};
 
 use crate::access::{daemon, token};
@@ -244,6 +244,14 @@ pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
     does(&daemon, "onlooker", &viewer)?;
     does(&daemon, "clearer", &admin)?;
     ensure!(daemon.servants_of("sights_py")?.len() == 1);
+    robot.leaves()
+}
+
+pub fn a_servant_of_ros_2_is_looked_into() -> Verdict {
+    let daemon = world().with(SIGHTS_TWO)?;
+    let mut robot = daemon.robot(&format!("{}?robot=rover", SIGHTS_TWO.name))?;
+    robot.calls("/rosapi/get_time", json!({}))?;
+    does(&daemon, "ros2", "")?;
     robot.leaves()
 }
 

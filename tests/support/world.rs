@@ -115,6 +115,13 @@ pub const SEER: Service = Service {
     arguments: &["--node", "people_detect"],
 };
 
+/// Our package of ROS 2 with what people look at.
+pub const SIGHTS_TWO: Service = Service {
+    name: "sights_ros2",
+    package: Some("sights_ros2"),
+    arguments: &["--node", "sights"],
+};
+
 /// Our C++ package, compiled at push.
 pub const GREETER: Service = Service {
     name: "greeter_cpp",

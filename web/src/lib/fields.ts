@@ -11,6 +11,16 @@ export interface Definition {
   constvalues?: string[];
 }
 
+/** Names that rosapi of ROS 2 takes from IDL, and those of message definitions. */
+const OF_IDL: { [name: string]: string } = { boolean: 'bool', octet: 'byte', float: 'float32', double: 'float64' };
+
+/** Definitions whose fields have the names of message definitions, whichever ROS they come from. */
+export const plain = (definitions: Definition[]): Definition[] =>
+  definitions.map((one) => ({ ...one, fieldtypes: one.fieldtypes.map((type) => OF_IDL[type] ?? type) }));
+
+/** The name of a message type without what ROS 2 has between package and name. */
+export const bare = (type: string) => type.replace('/msg/', '/');
+
 export type Value = unknown;
 export type Parts = { [name: string]: Value };
 

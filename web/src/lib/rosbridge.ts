@@ -30,7 +30,7 @@ export interface Hearing {
 /** What to do about what was refused, or has failed, inside. */
 function refusal(words: string): Problem {
   if (words.includes('not granted')) return Problem.here(words, 'to see a service is to listen there: ask its operator to do this, or for a rule that grants it (Access, Policy)');
-  if (/no definition|not known|does not exist|not advertised/.test(words)) return Problem.here(words, 'see what there is in the lists of this page; they are read when it is opened');
+  if (/no definition|not known|does not exist|not advertised/.test(words)) return Problem.here(words, 'see what there is in the lists of this page');
   return Problem.here(words, 'correct what was sent, and see what the node says of it in the servant’s log');
 }
 
