@@ -83,7 +83,8 @@ pub struct RolloutTerms {
     pub samples: u32,
     /// Seconds from becoming the current one to the end of servants of other revisions; none: they end when their robots leave.
     pub deadline: Option<f64>,
-    /// Seconds after which a canary that was not worse becomes the current one; none: when somebody says so.
+    /// Seconds after which a canary that was not worse becomes the current one, if there were `samples` requests to it; none: when
+    /// somebody says so.
     pub promote_after: Option<f64>,
 }
 
@@ -140,9 +141,9 @@ pub struct Arm {
     pub servants: u64,
     /// Those that failed.
     pub servants_failed: u64,
-    /// Requests that were answered or failed.
+    /// Requests that were answered, failed or were late.
     pub requests: u64,
-    /// Those that failed.
+    /// Those that failed, or were not answered within T_max.
     pub requests_failed: u64,
     /// Median of the answered ones' response times, milliseconds.
     pub p50: Option<f64>,
@@ -164,6 +165,9 @@ pub struct Rollout {
     pub state: RolloutState,
     /// The reason of its state.
     pub reason: String,
+    /// The reason why a canary is not promoted whose time for that has come.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waits: Option<String>,
     /// When it began.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub started: Millis,

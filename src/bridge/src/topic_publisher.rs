@@ -149,7 +149,11 @@ impl TopicPublisher {
             State::Live { publisher, .. } => {
                 // Not of what waits for connections: that is no time of the servant.
                 if let Some(requests) = &self.requests {
-                    requests.asked(&self.message_type, &bytes, Instant::now());
+                    let shared = &self.shared;
+                    let heard = requests.is_heard(|topic| !shared.live_fanouts(topic).is_empty());
+                    let now = Instant::now();
+                    let unanswered = requests.asked(&self.message_type, &bytes, now, heard);
+                    (0..unanswered).for_each(|_| shared.options.called.tell(None));
                 }
                 publisher.publish(bytes);
             }

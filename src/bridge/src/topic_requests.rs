@@ -25,6 +25,10 @@ struct Open {
     /// By which the answer is recognised; none where the next output answers.
     stamp: Option<Time>,
     since: Instant,
+    /// A client listened to one of the outputs: an answer would have been seen.
+    heard: bool,
+    /// A later one was answered: the servant has left it out.
+    left_out: bool,
 }
 
 impl TopicRequests {
@@ -53,25 +57,41 @@ impl TopicRequests {
     }
 
     /// A client's message on the input goes to the servant. Of several with one stamp the first is the request; without stamps
-    /// what comes before the answer is none.
-    pub(crate) fn asked(&self, of: &MessageType, bytes: &[u8], now: Instant) {
+    /// what comes before the answer is none. Returns how many earlier requests are given up that the servant has not answered:
+    /// those that were `heard`, and after which it has answered none.
+    pub(crate) fn asked(&self, of: &MessageType, bytes: &[u8], now: Instant, heard: bool) -> usize {
         let Some(stamp) = self.key(of, bytes) else {
-            return;
+            return 0;
         };
         let mut open = self.open.lock();
+        let mut unanswered = 0;
+        let mut forget = |open: &mut VecDeque<Open>| {
+            let first = open.pop_front();
+            unanswered += usize::from(first.is_some_and(|it| it.heard && heard && !it.left_out));
+        };
         while open
             .front()
             .is_some_and(|first| now.saturating_duration_since(first.since) >= FORGOTTEN)
         {
-            open.pop_front();
+            forget(&mut open);
         }
-        if open.iter().any(|one| one.stamp == stamp) {
-            return;
+        if open.iter().all(|one| one.stamp != stamp) {
+            if open.len() == OPEN {
+                forget(&mut open);
+            }
+            open.push_back(Open {
+                stamp,
+                since: now,
+                heard,
+                left_out: false,
+            });
         }
-        if open.len() == OPEN {
-            open.pop_front();
-        }
-        open.push_back(Open { stamp, since: now });
+        unanswered
+    }
+
+    /// Whether a client listens to an output, as far as `listened` knows of topics.
+    pub(crate) fn is_heard(&self, listened: impl Fn(&str) -> bool) -> bool {
+        self.pair.outputs.iter().any(|output| listened(output))
     }
 
     /// A message of the servant on one of the outputs; how long its request took, if it answers one. The first output that
@@ -86,6 +106,7 @@ impl TopicRequests {
         let mut open = self.open.lock();
         let at = open.iter().position(|one| one.stamp == stamp)?;
         let took = now.saturating_duration_since(open.remove(at)?.since);
+        open.iter_mut().take(at).for_each(|one| one.left_out = true);
         (took < FORGOTTEN).then_some(took)
     }
 }
@@ -127,11 +148,11 @@ mod tests {
         let requests = pair(Correlation::Stamp);
         let of = of_type("Stamped", "std_msgs/Header header\n");
         let began = Instant::now();
-        requests.asked(&of, &stamped(1, 0), began);
-        requests.asked(&of, &stamped(0, 2), began + SECOND);
+        requests.asked(&of, &stamped(1, 0), began, true);
+        requests.asked(&of, &stamped(0, 2), began + SECOND, true);
         // Again, and one that nobody has stamped.
-        requests.asked(&of, &stamped(1, 0), began + SECOND);
-        requests.asked(&of, &stamped(0, 0), began);
+        requests.asked(&of, &stamped(1, 0), began + SECOND, true);
+        requests.asked(&of, &stamped(0, 0), began, true);
         let answered = |secs, nsecs, after: u32| {
             requests.answered(&of, &stamped(secs, nsecs), began + SECOND * after)
         };
@@ -140,10 +161,10 @@ mod tests {
         assert_eq!(answered(0, 2, 2), Some(SECOND));
         assert_eq!(answered(1, 0, 3), Some(SECOND * 3));
         assert_eq!(answered(1, 0, 3), None, "it is answered");
-        requests.asked(&of, &stamped(1, 1), began);
+        requests.asked(&of, &stamped(1, 1), began, true);
         assert_eq!(answered(1, 1, 60), None, "that is no answer any more");
         // Too short to have a stamp.
-        requests.asked(&of, &stamped(1, 2)[..11], began);
+        requests.asked(&of, &stamped(1, 2)[..11], began, true);
         assert!(requests.open.lock().is_empty());
         assert!(requests.is_input("/in") && !requests.is_input("/out"));
         assert!(requests.is_output("/view") && !requests.is_output("/in"));
@@ -155,16 +176,16 @@ mod tests {
         let of = of_type("Text", "string data\n");
         let began = Instant::now();
         assert_eq!(requests.answered(&of, b"", began), None);
-        requests.asked(&of, b"", began);
-        requests.asked(&of, b"", began + SECOND);
+        requests.asked(&of, b"", began, true);
+        requests.asked(&of, b"", began + SECOND, true);
         assert_eq!(
             requests.answered(&of, b"", began + SECOND * 2),
             Some(SECOND * 2)
         );
         assert_eq!(requests.answered(&of, b"", began + SECOND * 2), None);
         // One that is never answered does not stand before others for ever.
-        requests.asked(&of, b"", began);
-        requests.asked(&of, b"", began + FORGOTTEN);
+        requests.asked(&of, b"", began, true);
+        requests.asked(&of, b"", began + FORGOTTEN, true);
         assert_eq!(
             requests.answered(&of, b"", began + FORGOTTEN + SECOND),
             Some(SECOND)
@@ -177,11 +198,33 @@ mod tests {
         let of = of_type("Stamped", "std_msgs/Header header\n");
         let began = Instant::now();
         for number in 1..=10 * OPEN as u32 {
-            requests.asked(&of, &stamped(number, 0), began);
+            requests.asked(&of, &stamped(number, 0), began, true);
         }
         assert_eq!(requests.open.lock().len(), OPEN);
         let last = stamped(10 * OPEN as u32, 0);
         assert_eq!(requests.answered(&of, &last, began), Some(Duration::ZERO));
         assert_eq!(requests.answered(&of, &stamped(1, 0), began), None);
+    }
+
+    #[test]
+    fn requests_that_are_not_answered_are_told_and_those_left_out_are_not() {
+        let requests = pair(Correlation::Stamp);
+        let of = of_type("Stamped", "std_msgs/Header header\n");
+        let began = Instant::now();
+        let asked = |secs, after: u32, heard| {
+            let now = began + SECOND * after;
+            requests.asked(&of, &stamped(secs, 0), now, heard)
+        };
+        for secs in 1..=4 {
+            assert_eq!(asked(secs, 0, true), 0);
+        }
+        assert_eq!(asked(5, 0, false), 0, "nobody would see its answer");
+        // It takes the newest, and has left out those before.
+        assert!(requests.answered(&of, &stamped(3, 0), began).is_some());
+        assert_eq!(asked(6, 60, true), 1, "the fourth alone");
+        assert_eq!(asked(7, 120, false), 0, "nobody listens any more");
+        // One after the other, too fast for anybody to answer in time.
+        let all = (10..10 + OPEN as u32 + 9).map(|secs| asked(secs, 200, true));
+        assert_eq!(all.sum::<usize>(), 9);
     }
 }

@@ -22,6 +22,7 @@ pub(crate) mod recent;
 pub(crate) mod rollouts;
 pub(crate) mod shadow;
 mod starting;
+mod visits;
 pub(crate) mod waiting;
 pub(crate) mod warm_pool;
 

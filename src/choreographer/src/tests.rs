@@ -9,6 +9,7 @@ use store::{Plan, RevisionRecord, State};
 mod controller;
 mod groups;
 mod servants;
+mod stuck;
 mod terms;
 
 fn revision(image: &str, cpus: f64) -> RevisionRecord {

@@ -51,7 +51,8 @@ pub struct TermFlags {
     /// Requests of each revision before they are compared; 20 by default.
     #[arg(long, value_name = "N", requires = "canary")]
     samples: Option<u32>,
-    /// Time after which a canary that was not worse becomes the current revision, such as 30m; when you say so by default.
+    /// Promote a canary that was not worse automatically after this time, such as 30m, once it has been asked as often as --samples
+    /// says (default: only by hand).
     #[arg(long, value_name = "TIME", value_parser = time, requires = "canary")]
     promote_after: Option<Duration>,
     /// Time from becoming the current revision to the end of servants of other revisions, such as 10m; without it they
@@ -131,7 +132,8 @@ pub async fn over(client: &Client, service: &str, wait: WaitFlag) -> anyhow::Res
     let look = || async move {
         let rollout: Shown = client.get(path).await?;
         let goes_on = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
-        let words = format!("{service} is at {}: {}", rollout.state, rollout.reason);
+        let why = rollout.waits.as_ref().unwrap_or(&rollout.reason);
+        let words = format!("{service} is at {}: {why}", rollout.state);
         Ok(if goes_on { Err(words) } else { Ok(rollout) })
     };
     wait.until(look).await
@@ -161,17 +163,16 @@ fn next_in_words(rollout: &Shown) -> Vec<String> {
             "it is taken back when it is worse by more than {}, from {} requests of each revision on",
             terms.bound, terms.samples
         ));
-        let of = &rollout.of_candidate;
-        words.push(match terms.promote_after {
-            Some(after) if of.servants <= of.servants_failed => format!(
-                "it becomes the current revision {} after it has begun, once a servant of it serves a robot; none does yet",
-                time(after)
+        words.push(match (&rollout.waits, terms.promote_after) {
+            (Some(waits), Some(_)) => format!(
+                "its time to become the current revision has come, and it waits: {waits}"
             ),
-            Some(after) => format!(
-                "it becomes the current revision {} after it has begun, unless it is worse",
-                time(after)
+            (_, Some(after)) => format!(
+                "it becomes the current revision {} after it has begun, unless it is worse, once it has been asked {} times",
+                time(after),
+                terms.samples
             ),
-            None => format!(
+            (_, None) => format!(
                 "it becomes the current revision when you say: cloudroidctl rollout {} promote",
                 rollout.service
             ),

@@ -149,7 +149,8 @@ impl Store {
                     store: self.images_dir().to_owned(),
                 });
             };
-            if known.tag() == Some(name) {
+            let mut of_image = index.manifests.iter().filter(|it| it.digest == *image);
+            if of_image.any(|entry| entry.tag() == Some(name)) {
                 return Ok((false, ()));
             }
             let mut tagged = known.clone();

@@ -2,6 +2,7 @@
 
 mod causes;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -43,7 +44,12 @@ pub async fn robot(app: &App, caller: &Caller, name: &str) -> Result<Explanation
             .await;
     Ok(Explanation {
         robot: name.to_owned(),
-        causes: causes::causes(&servants, &events, &failing(choreographer, name)),
+        causes: causes::causes(
+            &servants,
+            &events,
+            &failing(choreographer, name),
+            &waiting(choreographer, &servants),
+        ),
         servants,
         events,
     })
@@ -172,4 +178,16 @@ fn failing(choreographer: &Choreographer, robot: &str) -> Vec<api::BackOff> {
     let mut all = choreographer.back_offs();
     all.retain(|one| one.robot == robot);
     all
+}
+
+/// Rollouts of the robot's services whose canaries are not promoted although their time has come.
+fn waiting(choreographer: &Choreographer, servants: &[Served]) -> Vec<api::Rollout> {
+    let services = servants
+        .iter()
+        .map(|served| served.servant.service.as_str());
+    let services: BTreeSet<&str> = services.collect();
+    let rollouts = services
+        .into_iter()
+        .filter_map(|service| choreographer.rollout(service).ok());
+    rollouts.filter(|rollout| rollout.waits.is_some()).collect()
 }

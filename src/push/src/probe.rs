@@ -1,5 +1,7 @@
 //! Finds the interface of a new image: it is started once, as a servant, and looked at.
 
+mod started;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,8 +15,6 @@ use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, Servant};
 use servant::spec::Spec;
-use tokio::sync::mpsc;
-use tokio_util::task::TaskTracker;
 
 use super::request::Reporter;
 use super::{Pusher, naming, supplement};
@@ -22,15 +22,14 @@ use crate::Error;
 use choreographer::Permit;
 use store::Plan;
 
+pub(super) use started::{Alive, ProbeServant};
+
 /// The name of the looking node.
 pub(super) const NODE: &str = "/cloudroid_probe";
 /// As of a build: servants go before it where cores do not suffice.
 const WEIGHT: u64 = 20;
 /// Lines of a node's log that explain its failure.
 const LOG_LINES: usize = 20;
-
-/// Held by whatever is there of what was started.
-pub(super) type Alive = mpsc::Sender<()>;
 
 /// Starts the image once and records what it shows. Where a robot needs its room meanwhile, it is ended, and begins again
 /// when there is room.
@@ -44,14 +43,14 @@ pub(super) async fn interface(
 ) -> Result<Found, Error> {
     loop {
         let room = room(pusher, options, report).await?;
-        let (alive, mut gone) = mpsc::channel(1);
+        let (alive, mut gone) = Alive::begin(room);
         let tried = {
             // What it learns counts when it was there to the end.
             let mut plan = plan.clone();
             let found = tokio::select! {
                 biased;
                 found = shown(pusher, id, built, &mut plan, options, &alive) => Some(found?),
-                () = room.is_needed() => None,
+                () = alive.room().is_needed() => None,
             };
             found.map(|found| (found, plan))
         };
@@ -61,10 +60,9 @@ pub(super) async fn interface(
         }
         let words = "a robot needs its room: it is ended, and started again when there is room";
         report.step(words).await;
-        // What was started is being ended by a task: its room is given back when nothing is left of it.
+        // What was started is being ended by a task, which has the room as long as something is left of it.
         drop(alive);
         let _ = gone.recv().await;
-        drop(room);
     }
 }
 
@@ -110,11 +108,7 @@ pub(super) async fn start(
     let alive = alive.clone();
     let starting = pusher.tasks.spawn(async move {
         let servant = engine.start(spec).await?;
-        let trial = ProbeServant {
-            servant: Some(Arc::clone(&servant)),
-            tasks,
-            alive,
-        };
+        let trial = ProbeServant::new(Arc::clone(&servant), tasks, alive);
         Ok::<_, servant::Error>((servant, trial))
     });
     let started = starting.await;
@@ -308,36 +302,5 @@ pub(super) fn spec(
         nodes: plan.nodes.clone(),
         grants: plan.grants.clone(),
         resident: master::resident_config(&built.flavour, &plan.parameters),
-    }
-}
-
-/// A servant that ends with this value.
-pub(super) struct ProbeServant {
-    servant: Option<Arc<dyn Servant>>,
-    tasks: TaskTracker,
-    alive: Alive,
-}
-
-impl ProbeServant {
-    pub(super) async fn end(mut self) -> Result<(), Error> {
-        match self.servant.take() {
-            Some(servant) => Ok(servant.stop().await?),
-            None => Ok(()),
-        }
-    }
-}
-
-impl Drop for ProbeServant {
-    fn drop(&mut self) {
-        let Some(servant) = self.servant.take() else {
-            return;
-        };
-        let alive = self.alive.clone();
-        self.tasks.spawn(async move {
-            let _alive = alive;
-            if let Err(error) = servant.stop().await {
-                tracing::error!("the probe {} could not be ended: {error}", servant.id());
-            }
-        });
     }
 }

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use tokio::sync::mpsc;
 
-use crate::links::Nodes;
+use crate::links::{Nodes, RequestNews};
 use crate::{Linked, Observer};
 
 /// The nodes that stubs have started, and nothing else.
@@ -68,5 +68,5 @@ impl Observer for Events {
         self.0.lock().push((kind.to_owned(), message.to_owned()));
     }
     fn served_locally(&self, _robot: &str, _node: &str, _at: SystemTime, _why: Option<&str>) {}
-    fn measured(&self, _request: &Request) {}
+    fn measured(&self, _request: &Request, _news: RequestNews) {}
 }

@@ -66,7 +66,7 @@ use tokio::sync::watch;
 use components::Loads;
 use egress::Relays;
 use lifecycle::Stages;
-use links::LinkStatus;
+use links::{LinkStatus, RequestNews};
 use tap::Tap;
 
 pub use ends::how_it_ended;
@@ -109,8 +109,8 @@ pub trait Observer: Send + Sync + 'static {
     fn event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
     /// From `at` on a node of the robot is served by its local original, and why; none: by the cloud again.
     fn served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
-    /// The time of a request, and its parts, have become known.
-    fn measured(&self, request: &Request);
+    /// This has become known of a request, of one that was answered with the time and its parts.
+    fn measured(&self, request: &Request, news: RequestNews);
 }
 
 /// Whom a servant serves: nobody while it is a warm container.

@@ -23,6 +23,7 @@ mod node_time;
 mod nodes;
 mod outputs;
 mod parameters;
+mod requests;
 mod runs;
 mod seen;
 mod status;
@@ -32,7 +33,7 @@ mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use budget::Budget;
 use parking_lot::Mutex;
@@ -55,6 +56,7 @@ use attempts::Attempts;
 use duplicates::Machine;
 use node_link::NodeLink;
 pub use nodes::Nodes;
+pub use requests::RequestNews;
 pub use status::LinkStatus;
 use turns::Turns;
 
@@ -261,6 +263,7 @@ impl Hub {
         link.session.set_quality(hello.quality);
         link.session.peer_decodes(&hello.codecs);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
+        link.requests.connected(Instant::now());
         if let Err(lost) = send_open(&mut socket, &welcome).await {
             self.expire(&link, turn);
             return lost;

@@ -18,7 +18,7 @@ use servant::engine::{LogStart, NodeExit, Servant};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
-use crate::links::Nodes;
+use crate::links::{Nodes, RequestNews};
 use crate::{Linked, Observer, Recorded, Tenant, how_it_ended};
 
 use planned::Planned;
@@ -255,8 +255,8 @@ impl Nodes for LinkedNodes {
         self.told.decided(node, decision);
     }
 
-    fn measured(&self, request: &Request) {
-        self.told.observer().measured(request);
+    fn measured(&self, request: &Request, news: RequestNews) {
+        self.told.observer().measured(request, news);
     }
 
     fn warn(&self, kind: &str, text: &str) {

@@ -16,6 +16,7 @@ use package::interface::Interface;
 use package::inventory::Inventory;
 use reach::group::dispatch::Rules;
 use reach::group::{Group, seat};
+use reach::links::RequestNews;
 use reach::{Observer, Reach, ReachOptions, Recorded, Tenant};
 use ros::bus::{Bus, ParamValue, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
@@ -90,7 +91,7 @@ impl Observer for Nobody {
     }
     fn event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
     fn served_locally(&self, _: &str, _: &str, _: std::time::SystemTime, _: Option<&str>) {}
-    fn measured(&self, _: &Request) {}
+    fn measured(&self, _: &Request, _: RequestNews) {}
 }
 
 impl Tenant for Nobody {

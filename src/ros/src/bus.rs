@@ -35,6 +35,7 @@ pub use node_parameters::{
     ParameterEvents, ParameterKind, ParameterNames,
 };
 pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
+pub(crate) use parameters::{ParamTeller, changes_within};
 pub use qos::{Durability, Liveliness, Qos, Reliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
 pub use types::{Digest, ServiceType, WireFormat, WireType};

@@ -62,6 +62,14 @@ pub enum Error {
         /// Why it was refused.
         reason: String,
     },
+    /// Its shim runs and does not answer.
+    #[error(
+        "servant {id}: its shim does not answer; look whether it is stopped or starved, or end the servant"
+    )]
+    Unanswered {
+        /// The id.
+        id: String,
+    },
     /// There is no node of that name.
     #[error("servant {id} has no node {node}: see its nodes in its state")]
     NoNode {

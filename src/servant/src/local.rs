@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use api::Grants;
 
 use async_trait::async_trait;
-use tokio::sync::oneshot;
+use tokio::sync::{Semaphore, oneshot};
 use tokio::task::JoinSet;
 
 use crate::Error;
@@ -33,6 +33,9 @@ mod sweep;
 mod validate;
 
 pub use handle::LocalServant;
+
+/// Ended servants of which what is left is removed beside each other.
+const SWEEPS: usize = 16;
 
 /// Where each servant's uid range is taken from by default: 1879048192, the first of the 4094 ranges that systemd's
 /// documentation of user ids lists as unused. Ranges for `/etc/subuid` grow from 100000, those of systemd-nspawn from
@@ -381,10 +384,18 @@ impl LocalEngine {
 
     async fn sweep_all(&self, ended: &[Ended]) -> Vec<Error> {
         let home = &self.shared.config.home_servants_dir;
-        let mut failures = Vec::new();
-        for Ended { id, .. } in ended {
-            failures.extend(sweep::sweep(id, &home.join(id)).await.err());
+        // What does not go is waited for, and keeps no other.
+        let turns = Arc::new(Semaphore::new(SWEEPS));
+        let mut sweeps = JoinSet::new();
+        for ended in ended {
+            let (id, directory) = (ended.id.clone(), home.join(&ended.id));
+            let turns = Arc::clone(&turns);
+            sweeps.spawn(async move {
+                let _turn = turns.acquire().await;
+                sweep::sweep(&id, &directory).await
+            });
         }
-        failures
+        let swept = sweeps.join_all().await;
+        swept.into_iter().filter_map(Result::err).collect()
     }
 }

@@ -204,6 +204,7 @@ export interface Rollout {
   candidate: number;
   state: string;
   reason: string;
+  waits?: string;
   started: number;
   of_stable: Arm;
   of_candidate: Arm;

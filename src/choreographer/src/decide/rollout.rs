@@ -7,6 +7,7 @@
 //! times by the sign test (the share of requests that are slower than the other's median) with the same bounds.
 
 use std::f64::consts::PI;
+use std::fmt;
 
 use api::Millis;
 use api::rollout::{Arm, RolloutState, RolloutTerms, Share};
@@ -149,12 +150,87 @@ fn hash(words: &[&str], number: u64) -> u64 {
 pub enum Step {
     /// Nothing changes.
     Stays,
+    /// The time to promote the candidate has come, and this is missing.
+    Waits(Wait),
     /// The candidate is taken back, for this reason.
     RollsBack(String),
     /// The candidate becomes the current revision, for this reason.
     Promotes(String),
     /// Servants of other revisions than the candidate end.
     EndsOthers,
+}
+
+/// What a canary waits for whose time to be promoted has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wait {
+    /// No servant of it serves a robot.
+    Servant,
+    /// It was asked too seldom to know how it answers.
+    Requests {
+        /// So often it was asked.
+        seen: u64,
+        /// So often it must be.
+        needed: u64,
+    },
+    /// It fails more often than the bound allows, and the stable revision was asked too seldom to compare the two.
+    Comparison {
+        /// So many of the candidate's requests failed.
+        failed: Tries,
+        /// So often the stable revision was asked.
+        seen: u64,
+        /// So often it must be.
+        needed: u64,
+    },
+}
+
+impl Wait {
+    /// Whether somebody who was told of the other knows this one, too: only numbers have changed.
+    pub fn is_like(&self, other: &Wait) -> bool {
+        std::mem::discriminant(self) == std::mem::discriminant(other)
+    }
+}
+
+impl fmt::Display for Wait {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Wait::Servant => write!(out, "no servant of it serves a robot yet"),
+            Wait::Requests { seen, needed } => write!(
+                out,
+                "it was asked {seen} times and {needed} are needed to know that it answers (--samples)"
+            ),
+            Wait::Comparison {
+                failed,
+                seen,
+                needed,
+            } => write!(
+                out,
+                "{} of its {} requests failed, and the previous revision was asked {seen} times of the {needed} that are needed to compare \
+                 them (--samples)",
+                failed.failed, failed.all
+            ),
+        }
+    }
+}
+
+/// What is missing before a candidate whose time has come is promoted.
+fn missing(stable: &Seen, candidate: &Seen, terms: &RolloutTerms) -> Option<Wait> {
+    if candidate.servants.all <= candidate.servants.failed {
+        return Some(Wait::Servant);
+    }
+    let (needed, requests) = (u64::from(terms.samples.max(1)), candidate.requests);
+    if requests.all < needed {
+        return Some(Wait::Requests {
+            seen: requests.all,
+            needed,
+        });
+    }
+    let seen = stable.requests.all;
+    let fails = requests.failed as f64 > terms.bound * requests.all as f64;
+    (seen < needed && fails).then_some(Wait::Comparison {
+        failed: requests,
+        seen,
+        needed,
+    })
 }
 
 /// What becomes of a rollout at `now`.
@@ -166,17 +242,16 @@ pub fn step(of: &Rollout, now: Millis) -> Step {
             if let Some(reason) = worse(stable, candidate, &of.terms) {
                 return Step::RollsBack(reason);
             }
-            match of.terms.promote_after {
-                Some(after)
-                    if since(after) && candidate.servants.all > candidate.servants.failed =>
-                {
-                    let seen = candidate.requests.all;
-                    Step::Promotes(format!(
-                        "it was not worse within {after} s and {seen} requests"
-                    ))
-                }
-                _ => Step::Stays,
+            let Some(after) = of.terms.promote_after.filter(|after| since(*after)) else {
+                return Step::Stays;
+            };
+            if let Some(wait) = missing(stable, candidate, &of.terms) {
+                return Step::Waits(wait);
             }
+            let seen = candidate.requests.all;
+            Step::Promotes(format!(
+                "it was not worse within {after} s and {seen} requests"
+            ))
         }
         RolloutState::Draining if of.terms.deadline.is_none_or(since) => Step::EndsOthers,
         _ => Step::Stays,

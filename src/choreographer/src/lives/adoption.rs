@@ -90,8 +90,10 @@ impl Choreographer {
         let whole = self.clone();
         let removal = tokio::spawn(async move {
             let ends = useless.into_iter().map(|useless| whole.end(useless));
-            futures_util::future::join_all(ends).await;
-            for error in whole.inner.engine.sweep(&ended).await {
+            let ends = futures_util::future::join_all(ends);
+            // One that takes its time to end keeps nothing of the others from being removed.
+            let (_, failures) = tokio::join!(ends, whole.inner.engine.sweep(&ended));
+            for error in failures {
                 whole.report_leftover(&error);
             }
         });

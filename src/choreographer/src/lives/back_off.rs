@@ -37,6 +37,15 @@ impl BackOffs {
         Some((known.clone(), left))
     }
 
+    /// Whether the last servant of this revision for the robot has failed, and that is not forgotten.
+    pub(crate) fn is_failing(&self, service: &str, robot: &str, revision: &RevisionRecord) -> bool {
+        let failing = self.failing.lock();
+        let known = failing.get(&(service.to_owned(), robot.to_owned()));
+        known.is_some_and(|known| {
+            known.revision == revision.number && !is_forgotten(known, Instant::now().into_std())
+        })
+    }
+
     /// A servant has failed; gives what follows.
     pub(crate) fn failed(
         &self,
@@ -58,7 +67,8 @@ impl BackOffs {
         next
     }
 
-    fn recovered(&self, service: &str, robot: &str) {
+    /// The robot's servants do not fail any more.
+    pub(crate) fn recovered(&self, service: &str, robot: &str) {
         let key = (service.to_owned(), robot.to_owned());
         self.failing.lock().remove(&key);
     }

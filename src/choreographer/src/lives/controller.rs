@@ -15,6 +15,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::Inner;
 use super::limits::PLAIN_WEIGHT;
+use super::visits::Visits;
 use crate::decide::controller::{Facts, Goal, History, Outcome, control};
 use crate::decide::stall::{Reading, Stall};
 use crate::engine_limits;
@@ -34,6 +35,8 @@ struct Watch {
     servants: HashMap<String, Seen>,
     stall: Stall,
     swapped_in: Option<(Instant, u64)>,
+    /// Servants whose cores are being moved.
+    moves: Visits<()>,
 }
 
 /// What is remembered of a servant.
@@ -75,7 +78,7 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
         inner.note_stall(watch.stall.judge(reading, Instant::now().into_std()));
         let looked = watch.look(&inner).await;
         if inner.options.controller {
-            watch.control(&inner, looked).await;
+            watch.control(&inner, looked);
         }
     }
 }
@@ -180,24 +183,27 @@ impl Watch {
     }
 
     /// Moves cores.
-    async fn control(&mut self, inner: &Inner, looked: Vec<Looked>) {
+    fn control(&mut self, inner: &Arc<Inner>, mut looked: Vec<Looked>) {
+        self.moves.take_over();
         let cores = millicpus(inner.options.cores);
         // What this host cannot limit is not moved.
-        let movable: Vec<&Looked> = looked
-            .iter()
-            .filter(|one| one.enforced.cpus.is_some())
-            .collect();
+        looked.retain(|one| one.enforced.cpus.is_some());
         let now = Instant::now().into_std();
-        let facts: Vec<Facts<'_>> = movable
+        let facts: Vec<Facts<'_>> = looked
             .iter()
             .map(|one| one.facts(inner, cores, now))
             .collect();
         let outcomes = control(cores, &facts, now);
-        for (one, outcome) in movable.into_iter().zip(outcomes) {
-            if let Some(seen) = self.servants.get_mut(&one.handle.id) {
+        for (one, outcome) in looked.into_iter().zip(outcomes) {
+            let id = one.handle.id.clone();
+            if let Some(seen) = self.servants.get_mut(&id) {
                 seen.history = outcome.history;
             }
-            one.carry_out(inner, &outcome).await;
+            if outcome.quota.is_some() || outcome.weight.is_some() {
+                let inner = Arc::clone(inner);
+                self.moves
+                    .begin(&id, async move { one.carry_out(&inner, &outcome).await });
+            }
         }
     }
 }
@@ -246,9 +252,6 @@ impl Looked {
     }
 
     async fn carry_out(&self, inner: &Inner, outcome: &Outcome) {
-        if outcome.quota.is_none() && outcome.weight.is_none() {
-            return;
-        }
         let handle = &self.handle;
         let _turn = handle.limits_turn().await;
         // Somebody has changed what it is to have: it is looked at again.

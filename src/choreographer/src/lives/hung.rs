@@ -8,6 +8,7 @@ use api::{Phase, Sla, Stated, Terms};
 use tokio::time::Instant;
 
 use super::Inner;
+use super::visits::Visits;
 use crate::decide::hung::{Flow, Hung, Watched, look};
 use crate::lives::handle::Handle;
 use crate::options::{self, Class};
@@ -21,8 +22,10 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
         return;
     }
     let mut watched: HashMap<(String, String), (Watched, String)> = HashMap::new();
+    let mut kills = Visits::default();
     loop {
         tokio::time::sleep(LOOK).await;
+        kills.take_over();
         let servants: Vec<Arc<Handle>> = {
             let servants = inner.servants.lock();
             servants.all.values().cloned().collect()
@@ -56,7 +59,11 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                 let (before, mut words) = watched.remove(&key).unzip();
                 let (after, hung) = look(before, seen, patience, Instant::now().into_std());
                 if let Some(hung) = hung {
-                    words = Some(act(&inner, &handle, &key.1, hung).await);
+                    let tidings = act(&inner, &handle, &key.1, hung);
+                    if let Some(killed) = tidings.kills {
+                        kills.begin(&handle.id, kill(Arc::clone(&handle), killed));
+                    }
+                    words = Some(tidings.words);
                 }
                 let words = words.unwrap_or_default();
                 if after.hangs() {
@@ -77,8 +84,16 @@ fn by_class(terms: &Terms, classes: &BTreeMap<String, Class>) -> Option<Sla> {
     (!terms.stated.values().any(says)).then_some(class.sla)
 }
 
-/// What hangs, in words. `node`: that of a stub; nothing: those that rosbridge clients use.
-async fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> String {
+/// Nodes hang.
+struct Tidings {
+    /// What hangs.
+    words: String,
+    /// The node that is to be killed for it.
+    kills: Option<String>,
+}
+
+/// Tells that nodes hang. `node`: that of a stub; nothing: those that rosbridge clients use.
+fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> Tidings {
     let own = &handle.revision.plan.nodes;
     let nodes: Vec<&str> = match node {
         "" => own.iter().map(|node| &*node.name).collect(),
@@ -114,13 +129,19 @@ async fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> String {
     if let Some(reach) = handle.reach() {
         reach.report(node, &format!("servant {}: {what}", handle.id));
     }
-    if let ([node], true, Some(container)) = (&*nodes, kills, handle.container())
-        && let Err(error) = container.signal_node(node, libc::SIGKILL).await
-    {
-        tracing::warn!(
-            "{node} of {} hangs and cannot be killed: {error}",
-            handle.id
-        );
+    let killed = nodes.first().filter(|_| kills);
+    Tidings {
+        kills: killed.map(|node| (*node).to_owned()),
+        words: what,
     }
-    what
+}
+
+async fn kill(handle: Arc<Handle>, node: String) {
+    let Some(container) = handle.container() else {
+        return;
+    };
+    if let Err(error) = container.signal_node(&node, libc::SIGKILL).await {
+        let id = &handle.id;
+        tracing::warn!("{node} of {id} hangs and cannot be killed: {error}");
+    }
 }

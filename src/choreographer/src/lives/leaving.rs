@@ -10,6 +10,8 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::Inner;
 use super::measuring::Refusal;
+use super::visits::Visits;
+use crate::Error;
 use crate::lives::handle::Handle;
 
 /// Between two looks.
@@ -18,6 +20,7 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Looks, for ever.
 pub(crate) async fn watch(inner: Arc<Inner>) {
     let mut refusals: HashMap<String, Refusal> = HashMap::new();
+    let mut visits: Visits<(Arc<Handle>, Result<(), Error>)> = Visits::default();
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let grace = inner.options.grace;
@@ -25,6 +28,10 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
         looks.tick().await;
         if inner.is_ending() {
             return;
+        }
+        for (id, (handle, outcome)) in visits.take_over() {
+            let refused = Refusal::after(refusals.remove(&id), outcome, &inner, &handle);
+            refusals.extend(refused.map(|refused| (id, refused)));
         }
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
         let has_left = |handle: &Arc<Handle>| {
@@ -42,10 +49,11 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
             if refused.is_some_and(|refused| !refused.is_due(now)) {
                 continue;
             }
-            let outcome = inner.forget_stated(&handle, grace).await;
-            let refused = refusals.remove(&handle.id);
-            let refused = Refusal::after(refused, outcome, &inner, &handle);
-            refusals.extend(refused.map(|refused| (handle.id.clone(), refused)));
+            let (id, inner) = (handle.id.clone(), Arc::clone(&inner));
+            visits.begin(&id, async move {
+                let outcome = inner.forget_stated(&handle, grace).await;
+                (handle, outcome)
+            });
         }
     }
 }

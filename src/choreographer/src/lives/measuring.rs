@@ -9,6 +9,7 @@ use ros::sizes::Seen;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::Inner;
+use super::visits::Visits;
 use crate::Error;
 use crate::decide::measured::Input;
 use crate::lives::handle::Handle;
@@ -65,15 +66,28 @@ impl Refusal {
     }
 }
 
+/// A servant was to be given what its robot's messages cost.
+struct Given {
+    handle: Arc<Handle>,
+    inputs: Vec<Input>,
+    outcome: Result<(), Error>,
+}
+
 /// Looks, for ever.
 pub(crate) async fn watch(inner: Arc<Inner>) {
     let mut watched: HashMap<String, Watched> = HashMap::new();
+    let mut visits = Visits::default();
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         looks.tick().await;
         if inner.is_ending() {
             return;
+        }
+        for (id, given) in visits.take_over() {
+            if let Some(watched) = watched.get_mut(&id) {
+                watched.note(given, &inner);
+            }
         }
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
         watched.retain(|id, _| handles.iter().any(|handle| handle.id == *id));
@@ -88,26 +102,41 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
             }
             if let Some(reach) = handle.reach() {
                 let watched = watched.entry(handle.id.clone()).or_default();
-                look(&inner, &handle, watched, reach.inputs()).await;
+                let inputs = watched.look(reach.inputs(), Instant::now());
+                if let Some(inputs) = inputs.filter(|_| visits.can_begin(&handle.id)) {
+                    let (id, inner) = (handle.id.clone(), Arc::clone(&inner));
+                    visits.begin(&id, async move {
+                        let outcome = inner.measured(&handle, &inputs).await;
+                        Given {
+                            handle,
+                            inputs,
+                            outcome,
+                        }
+                    });
+                }
             }
         }
     }
 }
 
-async fn look(inner: &Inner, handle: &Handle, watched: &mut Watched, seen: Vec<(String, Seen)>) {
-    let now = Instant::now();
-    let inputs = watched.inputs(seen, now);
-    let refused = watched.refused.as_ref();
-    let again = refused.is_some_and(|refused| refused.is_due(now));
-    if watched.known == inputs && !again {
-        return;
-    }
-    let outcome = inner.measured(handle, &inputs).await;
-    watched.known = inputs;
-    watched.refused = Refusal::after(watched.refused.take(), outcome, inner, handle);
-}
-
 impl Watched {
+    /// What was seen, where the servant is to be given what it costs.
+    fn look(&mut self, seen: Vec<(String, Seen)>, now: Instant) -> Option<Vec<Input>> {
+        let inputs = self.inputs(seen, now);
+        let again = self.refused.as_ref().is_some_and(|it| it.is_due(now));
+        (self.known != inputs || again).then_some(inputs)
+    }
+
+    fn note(&mut self, given: Given, inner: &Inner) {
+        let Given {
+            handle,
+            inputs,
+            outcome,
+        } = given;
+        self.known = inputs;
+        self.refused = Refusal::after(self.refused.take(), outcome, inner, &handle);
+    }
+
     /// What was seen, without what changes with each message and says nothing new.
     fn inputs(&mut self, seen: Vec<(String, Seen)>, now: Instant) -> Vec<Input> {
         use crate::decide::measured::{ENOUGH, PATIENCE};

@@ -7,6 +7,7 @@ use api::Level;
 use bridge::{BridgeOptions, Called};
 use catalogue::{Catalogue, Known};
 use link::control::Request;
+use reach::links::RequestNews;
 use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
 use servant::engine::Servant;
 use store::{Journal, NewEvent, RevisionRecord};
@@ -90,16 +91,22 @@ impl Measures {
         })
     }
 
-    /// A request took so many milliseconds, of which so many in the cloud.
-    fn note(&self, request: &Request, cloud: f64) {
+    /// This has become known of a request, which took so many milliseconds in the cloud.
+    fn note(&self, request: &Request, cloud: f64, news: RequestNews) {
         let service = &self.revision.service;
         self.request_times.note(service, request);
         if let Some(total) = request.total {
             let now = Instant::now().into_std();
             self.recent.note(&self.servant, total, cloud, now);
         }
-        let rollouts = &self.rollouts;
-        rollouts.note_request(service, self.revision.number, request.total);
+        let (rollouts, revision) = (&self.rollouts, self.revision.number);
+        match (news, request.total) {
+            (RequestNews::Late, _) | (_, None) => rollouts.note_request(service, revision, None),
+            (RequestNews::Answered, total) => rollouts.note_request(service, revision, total),
+            (RequestNews::AnsweredLate, Some(total)) => {
+                rollouts.note_late_answer(service, revision, total);
+            }
+        }
     }
 
     /// Hears of the requests of rosbridge's clients. The time between them and the bridge is not known: what is measured is a
@@ -112,7 +119,8 @@ impl Measures {
                 total,
                 ..Request::default()
             };
-            measures.note(&request, total.unwrap_or_default());
+            let cloud = total.unwrap_or_default();
+            measures.note(&request, cloud, RequestNews::Answered);
         })
     }
 }
@@ -170,7 +178,8 @@ impl Observer for Reports {
         self.journal.local((service, robot, node), at, why);
     }
 
-    fn measured(&self, request: &Request) {
-        self.measures.note(request, request.queue + request.compute);
+    fn measured(&self, request: &Request, news: RequestNews) {
+        let cloud = request.queue + request.compute;
+        self.measures.note(request, cloud, news);
     }
 }

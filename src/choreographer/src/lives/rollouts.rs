@@ -15,7 +15,7 @@ use tokio::sync::Notify;
 pub use orders::check_terms;
 
 use super::Inner;
-use crate::decide::rollout::{Given, Rollout, Step, given, step};
+use crate::decide::rollout::{Given, Rollout, Step, Wait, given, step};
 use crate::lives::handle::Handle;
 use crate::request::serves_no_robot;
 use crate::{Error, ServantRequest};
@@ -41,6 +41,8 @@ struct Kept {
     by_service: BTreeMap<String, Rollout>,
     /// Services whose counts or robots are not written yet.
     changed: BTreeSet<String>,
+    /// What canaries wait for whose time to be promoted has come, by service.
+    waits: BTreeMap<String, Wait>,
 }
 
 fn goes_on(of: &Rollout) -> bool {
@@ -54,6 +56,11 @@ impl Rollouts {
             seen.requests.note(millis.is_none());
             millis.into_iter().for_each(|time| seen.times.note(time));
         });
+    }
+
+    /// A request that counts as failed, since it was late, was answered after all, after so many milliseconds.
+    pub(crate) fn note_late_answer(&self, service: &str, revision: u64, millis: f64) {
+        self.note(service, revision, |seen| seen.times.note(millis));
     }
 
     /// A servant has become ready, or has failed. One that is measured may be given limits that no servant can do with, and
@@ -166,6 +173,31 @@ impl Inner {
         })
     }
 
+    /// What the canary of a service waits for whose time to be promoted has come.
+    fn rollout_waits(&self, service: &str) -> Option<Wait> {
+        self.rollouts.kept.lock().waits.get(service).copied()
+    }
+
+    /// Notes what a canary waits for, and tells of it when that is another thing than before.
+    fn set_rollout_waits(&self, service: &str, candidate: u64, wait: Option<Wait>) {
+        let before = {
+            let waits = &mut self.rollouts.kept.lock().waits;
+            match wait {
+                Some(wait) => waits.insert(service.to_owned(), wait),
+                None => waits.remove(service),
+            }
+        };
+        let news = wait.filter(|wait| !before.is_some_and(|before| before.is_like(wait)));
+        if let Some(wait) = news {
+            let message = format!("revision {candidate} of {service} is not promoted yet: {wait}");
+            let about = NewEvent {
+                service: Some(service),
+                ..NewEvent::default()
+            };
+            self.journal.info("rollout-waits", &message, &about);
+        }
+    }
+
     fn rollout(&self, service: &str) -> Option<Rollout> {
         self.rollouts.kept.lock().by_service.get(service).cloned()
     }
@@ -229,6 +261,7 @@ impl Inner {
                 (rollout.state, rollout.changed) = (next.state, next.changed);
                 rollout.reason.clone_from(&next.reason);
             }
+            kept.waits.remove(service);
             next
         };
         self.tell_rollout(service, &next);
@@ -301,8 +334,14 @@ impl Inner {
             return Ok(());
         };
         let candidate = rollout.candidate;
-        match step(&rollout, store::now()) {
-            Step::Stays => {}
+        let step = step(&rollout, store::now());
+        let wait = match step {
+            Step::Waits(wait) => Some(wait),
+            _ => None,
+        };
+        self.set_rollout_waits(service, candidate, wait);
+        match step {
+            Step::Stays | Step::Waits(_) => {}
             Step::RollsBack(reason) => {
                 self.take_back(service, candidate, RolloutState::RolledBack, &reason)?;
             }

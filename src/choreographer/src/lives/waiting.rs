@@ -15,7 +15,7 @@ use crate::decide::Amount;
 use crate::decide::admission::{Admitted, Ask, Book, Origin, Position, Refused, Ticket, Verdict};
 use crate::decide::capacity::{Lacking, Push};
 
-/// A robot that waited in vain and asks again within this time stands where it stood.
+/// A robot that waited in vain, or whose connection broke meanwhile, and asks again within this time stands where it stood.
 const KEPT: Duration = Duration::from_secs(30);
 /// Places that are kept at most.
 const MOST_KEPT: usize = 1000;
@@ -32,7 +32,7 @@ struct Desk {
     doors: HashMap<Ticket, Door>,
     /// Pushes that were admitted.
     pushes: HashMap<Ticket, Working>,
-    /// Of robots that waited in vain.
+    /// Of robots that waited in vain, or went away while they waited.
     kept: HashMap<String, Kept>,
     tickets: Ticket,
 }
@@ -290,7 +290,7 @@ impl Admission {
         self.admit_as(None, ask, deadline, stands, on_wait).await
     }
 
-    /// The same for `who`: where it has waited in vain lately, it stands where it stood.
+    /// The same for `who`: where it has waited in vain lately, or has gone away while it waited, it stands where it stood.
     pub(crate) async fn admit_as(
         &self,
         who: Option<&str>,
@@ -300,7 +300,7 @@ impl Admission {
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Refused> {
         let standing = stands.subscribe();
-        let (waiting, admitted) = {
+        let (mut waiting, admitted) = {
             let mut desk = self.desk.lock();
             let kept = who.and_then(|who| desk.kept.remove(who));
             let kept = kept.filter(|kept| kept.since.elapsed() < KEPT);
@@ -337,19 +337,23 @@ impl Admission {
             hand_over(told);
             match outcome {
                 Ok((ticket, admitted)) => {
-                    let admission = self;
-                    (Waiting { admission, ticket }, admitted)
+                    let waiting = Waiting {
+                        admission: self,
+                        ticket,
+                        who,
+                    };
+                    (waiting, admitted)
                 }
                 Err(at_once) => return at_once,
             }
         };
         on_wait();
         match tokio::time::timeout(deadline, admitted).await {
-            Ok(Ok(permit)) => Ok(permit),
+            Ok(Ok(permit)) => {
+                waiting.who = None;
+                Ok(permit)
+            }
             _ => {
-                if let Some(who) = who {
-                    self.desk.lock().keep(who, waiting.ticket);
-                }
                 let standing = standing.borrow().clone();
                 Err(late(deadline, standing, self.stalled()))
             }
@@ -377,11 +381,9 @@ fn late(waited: Duration, standing: Option<Standing>, stalled: Option<String>) -
 }
 
 impl Desk {
-    /// Keeps the place of one that waits, for when it asks again.
+    /// Keeps the place of one that waits, or was admitted and has not heard of it, for when it asks again.
     fn keep(&mut self, who: &str, ticket: Ticket) {
-        let Some(overtaken) = self.book.overtaken(ticket) else {
-            return;
-        };
+        let overtaken = self.book.overtaken(ticket).unwrap_or(0);
         self.kept.retain(|_, kept| kept.since.elapsed() < KEPT);
         if self.kept.len() < MOST_KEPT {
             let kept = Kept {
@@ -416,11 +418,19 @@ impl Desk {
 struct Waiting<'a> {
     admission: &'a Admission,
     ticket: Ticket,
+    /// Whose place is kept when it stops.
+    who: Option<&'a str>,
 }
 
 impl Drop for Waiting<'_> {
     fn drop(&mut self) {
-        let door = self.admission.desk.lock().doors.remove(&self.ticket);
+        let door = {
+            let mut desk = self.admission.desk.lock();
+            if let Some(who) = self.who {
+                desk.keep(who, self.ticket);
+            }
+            desk.doors.remove(&self.ticket)
+        };
         self.admission.decide(|book| ((), book.leave(self.ticket)));
         // A permit that was handed over to nobody is dropped with it, which locks the desk.
         drop(door);
@@ -517,6 +527,55 @@ mod tests {
         }
         drop(all);
         behind.await.expect("no panic").expect("it is the first");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_goes_away_while_it_waits_and_comes_back_soon_stands_where_it_stood() {
+        let room = machine();
+        let mut all = Some(robot(&room, 2.0, SECOND, || {}).await.expect("it is free"));
+        let asks = |who: &'static str| {
+            let (stands, ask) = (watch::Sender::new(None), Ask::robot(Amount::new(2.0, 0), 0));
+            let (watched, room) = (stands.subscribe(), room.clone());
+            let waiting = async move {
+                let admitted = room.admit_as(Some(who), ask, SECOND * 100, stands, || {});
+                admitted.await
+            };
+            (watched, tokio::spawn(waiting))
+        };
+        let place = |stands: &watch::Receiver<Option<Standing>>| {
+            let stands = stands.borrow();
+            stands.as_ref().map(|stands| stands.place.place)
+        };
+        // The second time it is admitted before it hears of it.
+        for is_admitted in [false, true] {
+            let (_, first) = asks("a");
+            tokio::task::yield_now().await;
+            let (other, behind) = asks("b");
+            tokio::task::yield_now().await;
+            assert_eq!(place(&other), Some(2));
+            if is_admitted {
+                drop(all.take());
+                assert!(!first.is_finished());
+            }
+            first.abort();
+            let _ = first.await;
+            let (stands, again) = asks("a");
+            tokio::task::yield_now().await;
+            if is_admitted {
+                // The other has what came free, and it is the next.
+                assert_eq!(place(&stands), Some(1));
+                drop(behind.await.expect("no panic"));
+                again.await.expect("no panic").expect("it comes free");
+            } else {
+                assert_eq!((place(&stands), place(&other)), (Some(1), Some(2)));
+                for waits in [again, behind] {
+                    waits.abort();
+                    let _ = waits.await;
+                }
+                tokio::time::sleep(KEPT).await;
+            }
+        }
+        assert_eq!(room.look().2, 0);
     }
 
     #[tokio::test(start_paused = true)]

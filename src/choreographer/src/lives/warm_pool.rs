@@ -34,6 +34,8 @@ pub(crate) use keeping::{end_all, give_back, keep, tidy};
 /// Whose a container of the pool is in the database, from the start of its nodes until a robot takes it. No robot can give
 /// itself this name.
 pub(crate) const NOBODY: &str = "~warm";
+/// By which it is remembered that a service's containers cannot be made, as a robot's servants that fail.
+const UNMADE: &str = "~warm-container";
 /// From a container's taking to the next one's readiness, before it was measured.
 const LEAD: Duration = Duration::from_secs(1);
 /// Weight of the last lead time in their mean.

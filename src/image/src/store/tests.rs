@@ -743,6 +743,19 @@ fn images_have_names_and_keep_them() {
     world.store.tag("opencv_apps:latest", &image).unwrap();
     world.store.tag("opencv_apps:latest", &other).unwrap();
     world.store.tag("opencv_apps:latest", &other).unwrap();
+    // Of two tags of one image each is known as such: the index is written anew for neither.
+    world.store.tag("opencv_apps:2", &image).unwrap();
+    let index = || {
+        std::fs::metadata(world.store.images_dir().join("index.json"))
+            .unwrap()
+            .ino()
+    };
+    let written = index();
+    for name in ["opencv_apps:1", "opencv_apps:2"] {
+        world.store.tag(name, &image).unwrap();
+        assert_eq!(index(), written, "{name}");
+    }
+    world.store.untag("opencv_apps:2").unwrap();
 
     let reopened = open(world.directory.path());
     let tags = reopened.tags().unwrap();

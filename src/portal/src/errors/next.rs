@@ -272,6 +272,9 @@ fn next_of_engine(error: &servant::Error) -> &'static str {
         | E::NoNode { .. } => {
             "see what became of the servant with: cloudroidctl events, then try again"
         }
+        E::Unanswered { .. } => {
+            "see whether its shim runs with: cloudroidctl doctor, or end the servant"
+        }
         E::Isolation { .. }
         | E::IdmapUnsupported { .. }
         | E::NoUidRange { .. }

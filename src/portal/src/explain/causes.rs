@@ -20,6 +20,7 @@ pub(super) fn causes(
     servants: &[Served],
     events: &[Event],
     failing: &[api::BackOff],
+    waiting: &[api::Rollout],
 ) -> Vec<Cause> {
     let mut causes = Vec::new();
     let mut say = |weight, what: String, next: String| causes.push(Cause { weight, what, next });
@@ -49,6 +50,17 @@ pub(super) fn causes(
         for link in &served.links {
             of_link(served, link, &mut say);
         }
+    }
+    for rollout in waiting {
+        let (service, revision) = (&rollout.service, rollout.candidate);
+        let why = rollout.waits.as_deref().unwrap_or_default();
+        say(
+            Weight::Hint,
+            format!("revision {revision} of {service}, a canary, is not promoted yet: {why}"),
+            format!(
+                "cloudroidctl rollout {service}; to decide by hand: cloudroidctl rollout {service} promote, or abort"
+            ),
+        );
     }
     // Only the last one: what was lost before that is of an earlier state.
     let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);

@@ -16,7 +16,7 @@ use tokio::sync::{mpsc, watch};
 use super::bus::GroupBus;
 use super::names::Names;
 use super::view::{Alias, View};
-use crate::links::Nodes;
+use crate::links::{Nodes, RequestNews};
 use crate::nodes::{Told, program, running};
 use crate::{Observer, Recorded, Tenant};
 
@@ -263,8 +263,8 @@ impl Nodes for SharedNodes {
         self.told.decided(node, decision);
     }
 
-    fn measured(&self, request: &Request) {
-        self.told.observer().measured(request);
+    fn measured(&self, request: &Request, news: RequestNews) {
+        self.told.observer().measured(request, news);
     }
 
     fn warn(&self, kind: &str, text: &str) {

@@ -1,8 +1,8 @@
 //! One node's link: what the robot tells is done here, in order.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, Weak};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use budget::Permit;
 use parking_lot::Mutex;
@@ -16,11 +16,12 @@ use super::inputs::Inputs;
 use super::lent::RobotServices;
 use super::node_time::{self, NodeTime};
 use super::outputs::Outputs;
+use super::requests::Requests;
 use super::unsent::Unsent;
 use super::{Hub, LinkStatus, mirror, seen};
 use crate::Flow;
 use link::clock::Sample;
-use link::control::{FromCloud, FromRobot, Hello, Refused, Request, Sla};
+use link::control::{FromCloud, FromRobot, Hello, Refused, Sla};
 use link::drops::{Drop, Drops, Reporter};
 use link::record::{Called, Record};
 use link::session::{CloudSession, Handler, SessionOptions};
@@ -29,8 +30,6 @@ use ros::codec::Stamps;
 use ros::ros2::names;
 use ros::sizes::Sizes;
 
-/// Requests remembered, for whoever explains.
-const REQUESTS: usize = 128;
 /// Topics that are opened beside each other; more wait, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
 /// For the result of a goal of ROS 2, which is asked for when the goal begins and comes when it ends.
@@ -58,7 +57,7 @@ pub(super) struct NodeLink {
     pub(super) listening: Mutex<BTreeSet<String>>,
     pub(super) time: NodeTime,
     sla: Sla,
-    requests: Mutex<VecDeque<Request>>,
+    pub(super) requests: Requests,
     unsent: Unsent,
     /// On this side, but for the session's own.
     pub(super) drops: Drops,
@@ -117,7 +116,7 @@ impl NodeLink {
             listening: Mutex::default(),
             time: NodeTime::of(hello),
             sla: hello.sla.clone(),
-            requests: Mutex::default(),
+            requests: Requests::default(),
             unsent: Unsent::default(),
             drops: Drops::default(),
             held: Held::default(),
@@ -183,7 +182,7 @@ impl NodeLink {
         // Before the expression below, to whose end they would stay locked: `duplicates` looks at other links.
         let dropped = self.dropped.lock().clone();
         let refused = self.refused.lock().clone();
-        let requests = self.requests.lock().iter().cloned().collect();
+        let requests = self.requests.last();
         LinkStatus {
             node: self.node.clone(),
             up: self.session.is_up(),
@@ -444,21 +443,10 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
             }
             FromRobot::Parameters(changes) => hub.parameters.change(&hub, changes).await,
             FromRobot::Requests(requests) => {
-                let mut kept = link.requests.lock();
-                for request in requests {
-                    // What was late is told again when its answer has come after all.
-                    let known = kept.iter_mut().find(|known| known.id == request.id);
-                    let before = known.as_ref().and_then(|known| known.total);
-                    if before.is_none() && request.total.is_some() {
-                        hub.nodes.measured(&request);
-                    }
-                    match known {
-                        Some(known) => *known = request,
-                        None => kept.push_back(request),
-                    }
+                let news = link.requests.note(requests, link.sla.max, Instant::now());
+                for (request, new) in news {
+                    hub.nodes.measured(&request, new);
                 }
-                let surplus = kept.len().saturating_sub(REQUESTS);
-                kept.drain(..surplus);
             }
             FromRobot::Unsent { replaced, stale } => {
                 link.unsent.note(replaced.saturating_add(stale));

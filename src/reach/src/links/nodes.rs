@@ -7,6 +7,7 @@ use link::control::{Decision, Exit, Hello, Node, Request};
 use ros::bus::ParamValue;
 use tokio::sync::mpsc;
 
+use super::requests::RequestNews;
 use crate::{Linked, Tenant};
 
 /// What a servant does for its links.
@@ -40,8 +41,8 @@ pub trait Nodes: Send + Sync + 'static {
     fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)>;
     /// Its robot has decided something about the local original.
     fn decided(&self, _node: &str, _decision: &Decision) {}
-    /// The cloud's time of a request, and its parts, have become known: once for each request.
-    fn measured(&self, _request: &Request) {}
+    /// This has become known of a request, of one that was answered with the cloud's time and its parts.
+    fn measured(&self, _request: &Request, _news: RequestNews) {}
     /// Something that whoever looks after the server should know of this robot.
     fn warn(&self, kind: &str, text: &str);
     /// What this robot gives its node, and the node that answers in its place does not heed; in words.

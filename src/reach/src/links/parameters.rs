@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use budget::Permit;
 use parking_lot::Mutex;
 use ros::bus::{BusError, ParamValue};
 use ros::ros1::own_parameters::is_of_master;
@@ -15,6 +16,9 @@ use super::runs::RUNS;
 use link::Echoes;
 use link::control::{FromCloud, Hello, Node};
 
+/// What a change takes that no robot was told of, besides its key and its value, in bytes.
+const UNTOLD: usize = 256;
+
 /// Whether the Master's side has it of itself, or keeps runs of nodes there.
 fn is_own(name: &str) -> bool {
     is_of_master(name) || name == RUNS.trim_start_matches('/')
@@ -25,8 +29,14 @@ fn is_own(name: &str) -> bool {
 pub(super) struct Known {
     set: Echoes,
     /// Set by a node before there was a link to tell it.
-    untold: Mutex<BTreeMap<String, Option<ParamValue>>>,
+    untold: Mutex<BTreeMap<String, Untold>>,
     watching: OnceCell<AbortHandle>,
+}
+
+/// A change that no robot was told of. It counts as the servant's.
+struct Untold {
+    value: Option<ParamValue>,
+    _held: Permit,
 }
 
 impl Drop for Known {
@@ -111,7 +121,7 @@ impl Known {
     }
 
     /// Tells the link whose node the parameter belongs to, or any: they are on one robot.
-    fn report(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+    pub(super) fn report(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
         if key.starts_with(RUNS) || self.set.is_echo(&key, value.as_ref()) {
             return;
         }
@@ -121,15 +131,30 @@ impl Known {
             Some(link) => link
                 .session
                 .report(&FromCloud::Parameters(vec![(key, value)])),
-            None => drop(self.untold.lock().insert(key, value)),
+            None => self.keep(hub, key, value),
+        }
+    }
+
+    /// Keeps a change for when there is a link, where there is memory for it.
+    fn keep(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+        let mut untold = self.untold.lock();
+        // It is of no use any more, whatever becomes of this one.
+        untold.remove(&key);
+        let bytes = UNTOLD + key.len() + value.as_ref().map_or(0, ParamValue::bytes_held);
+        match hub.options.budget.take(bytes) {
+            Ok(_held) => drop(untold.insert(key, Untold { value, _held })),
+            Err(error) => tracing::warn!(
+                servant = hub.servant,
+                "the parameter {key} was set before a robot's node was linked, and will not reach the robot: {error}"
+            ),
         }
     }
 
     /// What a node has set before there was a link to tell.
     pub(super) fn untold(&self) -> Vec<(String, Option<ParamValue>)> {
-        std::mem::take(&mut *self.untold.lock())
-            .into_iter()
-            .collect()
+        let untold = std::mem::take(&mut *self.untold.lock());
+        let changes = untold.into_iter();
+        changes.map(|(key, untold)| (key, untold.value)).collect()
     }
 }
 

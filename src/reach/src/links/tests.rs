@@ -163,6 +163,33 @@ async fn parameters_of_a_hello_count_until_they_are_set() {
 }
 
 #[tokio::test]
+async fn parameters_that_are_set_before_there_is_a_link_are_paid_for() {
+    let budget = Budget::new("servant s1", 1 << 20);
+    let options = HubOptions {
+        budget: budget.clone(),
+        ..HubOptions::default()
+    };
+    let (hub, _nodes) = hub_with(options).await;
+    let parameters = &hub.parameters;
+    let text = || Some(ParamValue::String("x".repeat(10_000)));
+    for _ in 0..1000 {
+        parameters.report(&hub, "/again".into(), text());
+    }
+    assert!(
+        budget.used() < 20_000,
+        "{} bytes: one is kept",
+        budget.used()
+    );
+    for number in 0..1000 {
+        parameters.report(&hub, format!("/more/{number}"), text());
+    }
+    assert!(budget.refused() > 800, "{} were refused", budget.refused());
+    let untold = parameters.untold();
+    assert!((90..=104).contains(&untold.len()), "{}", untold.len());
+    assert_eq!(budget.used(), 0, "whoever tells them pays for them");
+}
+
+#[tokio::test]
 async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
     let mut long = hello("/detect", 1);
     long.parameters = many_parameters();

@@ -1,20 +1,19 @@
 //! Parameters that all nodes share, where a ROS has them.
 
+mod changes;
 mod reading;
 
 use std::collections::BTreeMap;
 use std::hash::{Hash, Hasher};
 
 use async_trait::async_trait;
-use tokio::sync::mpsc;
 
 use super::BusError;
+pub use changes::ParamChanges;
+pub(crate) use changes::{ParamTeller, changes_within};
 
 /// One changed parameter: its key, and its value unless it was deleted.
 pub type ParamChange = (String, Option<ParamValue>);
-
-/// Parameters as they change: key and value, or no value where one was deleted.
-pub type ParamChanges = mpsc::UnboundedReceiver<ParamChange>;
 
 /// The parameters of a whole ROS system. ROS 1 has them; ROS 2's belong to nodes.
 #[async_trait]

@@ -39,7 +39,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, watch};
 use tokio::task::{AbortHandle, JoinSet};
 
 use self::calls::CallPool;
@@ -53,7 +53,7 @@ use super::names;
 use crate::JoinOptions;
 use crate::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    Hearing, Lending, ParamChange, ParamValue, Publisher, Qos, RosVersion, ServiceHandler,
+    Hearing, Lending, ParamTeller, ParamValue, Publisher, Qos, RosVersion, ServiceHandler,
     ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
@@ -103,7 +103,7 @@ pub(super) struct Inner {
     publisher_clients: heard::PublisherClients,
     pub(super) graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
-    param_watcher: Mutex<Option<mpsc::UnboundedSender<ParamChange>>>,
+    param_watcher: Mutex<Option<ParamTeller>>,
     closed: AtomicBool,
     runtime: Handle,
     tasks: Mutex<JoinSet<()>>,

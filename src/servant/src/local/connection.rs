@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
@@ -14,6 +15,9 @@ use crate::protocol::{self, Command, FromShim, NodeStatus, Request, Snapshot};
 
 /// Events that a slow listener may be behind.
 const EVENTS: usize = 256;
+/// Requests that a shim may not have answered: so few that they fit into the socket, and none is left half written there by
+/// somebody who has waited long enough.
+const UNANSWERED: usize = 64;
 
 /// What is known of a servant.
 #[derive(Debug)]
@@ -116,17 +120,20 @@ impl Known {
         Some(self.init.load(Ordering::Acquire)).filter(|pid| *pid != 0)
     }
 
-    /// A number for a request, and where its answer will come; none when the connection is closed.
-    fn expect_answer(&self) -> Option<(u64, oneshot::Receiver<Option<String>>)> {
+    /// A number for a request, and where its answer will come.
+    fn expect_answer(&self) -> Result<(u64, oneshot::Receiver<Option<String>>), Unfulfilled> {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         if waiting.closed {
-            return None;
+            return Err(Unfulfilled::Gone);
+        }
+        if waiting.answers.len() >= UNANSWERED {
+            return Err(Unfulfilled::Silent);
         }
         let id = waiting.next;
         waiting.next += 1;
         let (sender, receiver) = oneshot::channel();
         waiting.answers.insert(id, sender);
-        Some((id, receiver))
+        Ok((id, receiver))
     }
 }
 
@@ -143,6 +150,8 @@ pub(super) enum Unfulfilled {
     Refused(String),
     /// It does not answer any more.
     Gone,
+    /// It has not answered in time, or too many earlier ones.
+    Silent,
 }
 
 impl Requests {
@@ -157,7 +166,7 @@ impl Requests {
     }
 
     pub(super) async fn ask(&self, known: &Known, command: Command) -> Result<(), Unfulfilled> {
-        let (id, answer) = known.expect_answer().ok_or(Unfulfilled::Gone)?;
+        let (id, answer) = known.expect_answer()?;
         let line = protocol::line(&Request { id, command });
         self.write
             .lock()
@@ -170,5 +179,67 @@ impl Requests {
             Ok(Some(reason)) => Err(Unfulfilled::Refused(reason)),
             Err(_) => Err(Unfulfilled::Gone),
         }
+    }
+
+    /// The same, waiting no longer than `patience`. What was asked may be done later all the same.
+    pub(super) async fn ask_within(
+        &self,
+        known: &Known,
+        command: Command,
+        patience: Duration,
+    ) -> Result<(), Unfulfilled> {
+        let asked = tokio::time::timeout(patience, self.ask(known, command)).await;
+        asked.unwrap_or(Err(Unfulfilled::Silent))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use tokio::task::JoinSet;
+
+    use super::*;
+
+    fn signal() -> Command {
+        Command::SignalNode {
+            node: "/a".to_owned(),
+            signal: 9,
+            last: false,
+        }
+    }
+
+    #[tokio::test]
+    async fn a_shim_that_does_not_answer_is_asked_no_more_than_fits() {
+        let (daemon, shim) = UnixStream::pair().expect("a socket");
+        let (read, requests) = Requests::split(daemon);
+        let (requests, known) = (Arc::new(requests), Arc::new(Known::default()));
+        let listening = Arc::clone(&known);
+        let listener = tokio::spawn(async move { listening.listen(read).await });
+        let mut asks = JoinSet::new();
+        for _ in 0..UNANSWERED {
+            let (requests, known) = (Arc::clone(&requests), Arc::clone(&known));
+            asks.spawn(async move { requests.ask(&known, signal()).await });
+        }
+        let (from_daemon, mut to_daemon) = shim.into_split();
+        let mut lines = BufReader::new(from_daemon).lines();
+        let mut ids = Vec::new();
+        for _ in 0..UNANSWERED {
+            let line = lines.next_line().await.expect("read").expect("a line");
+            let request: Request = serde_json::from_str(&line).expect("it is whole");
+            ids.push(request.id);
+        }
+        let asked = requests.ask(&known, signal()).await;
+        assert!(matches!(asked, Err(Unfulfilled::Silent)), "{asked:?}");
+        for id in ids {
+            let answer = protocol::line(&FromShim::Reply { id, error: None });
+            to_daemon.write_all(&answer).await.expect("answered");
+        }
+        for asked in asks.join_all().await {
+            asked.expect("it answers after all");
+        }
+        let asked = requests.ask_within(&known, signal(), Duration::ZERO).await;
+        assert!(matches!(asked, Err(Unfulfilled::Silent)), "{asked:?}");
+        listener.abort();
     }
 }

@@ -281,7 +281,7 @@ impl LocalServant {
                 node: node.to_owned(),
             });
         }
-        self.ask(Command::SignalNode {
+        self.ask_briefly(Command::SignalNode {
             node: node.to_owned(),
             signal,
             last,
@@ -291,16 +291,23 @@ impl LocalServant {
 
     /// Asks the shim.
     async fn ask(&self, command: Command) -> Result<(), Error> {
-        self.requests
-            .ask(&self.known, command)
-            .await
-            .map_err(|unfulfilled| match unfulfilled {
-                Unfulfilled::Refused(reason) => Error::Refused {
-                    id: self.id.clone(),
-                    reason,
-                },
-                Unfulfilled::Gone => self.ended(),
-            })
+        let asked = self.requests.ask(&self.known, command).await;
+        asked.map_err(|unfulfilled| self.error(unfulfilled))
+    }
+
+    /// Asks the shim what takes it no time.
+    async fn ask_briefly(&self, command: Command) -> Result<(), Error> {
+        let asked = self.requests.ask_within(&self.known, command, ANSWER);
+        asked.await.map_err(|unfulfilled| self.error(unfulfilled))
+    }
+
+    fn error(&self, unfulfilled: Unfulfilled) -> Error {
+        let id = self.id.clone();
+        match unfulfilled {
+            Unfulfilled::Refused(reason) => Error::Refused { id, reason },
+            Unfulfilled::Silent => Error::Unanswered { id },
+            Unfulfilled::Gone => self.ended(),
+        }
     }
 
     fn ended(&self) -> Error {
@@ -405,7 +412,7 @@ impl Servant for LocalServant {
     }
 
     async fn set_limits(&self, limits: Limits) -> Result<Enforced, Error> {
-        self.ask(Command::SetLimits(limits)).await?;
+        self.ask_briefly(Command::SetLimits(limits)).await?;
         Ok(self.enforced())
     }
 

@@ -14,3 +14,4 @@ mod servants;
 
 pub use engine::MemoryEngine;
 pub use process::Process;
+pub use servants::MemoryServant;

@@ -41,6 +41,8 @@ pub struct MemoryServant {
     pub flow: Mutex<(u64, u64)>,
     /// What these clients were told of it.
     pub reported: Mutex<Vec<String>>,
+    /// Its shim answers nothing while this is so.
+    pub stuck: watch::Sender<bool>,
     /// Where services of its nodes are called.
     pub(crate) system: Arc<MemorySystem>,
 }
@@ -98,6 +100,7 @@ impl MemoryServant {
             inputs: Inputs::default(),
             flow: Mutex::default(),
             reported: Mutex::default(),
+            stuck: watch::Sender::new(false),
             system: Arc::default(),
         })
     }
@@ -139,6 +142,12 @@ impl MemoryServant {
             id: self.id.clone(),
             reason,
         }
+    }
+
+    /// Its shim answers.
+    async fn answers(&self) {
+        let mut stuck = self.stuck.subscribe();
+        let _ = stuck.wait_for(|is_stuck| !is_stuck).await;
     }
 
     fn check_runs(&self) -> Result<(), Error> {
@@ -313,6 +322,7 @@ impl Servant for MemoryServant {
     }
 
     async fn set_limits(&self, limits: Limits) -> Result<Enforced, Error> {
+        self.answers().await;
         self.check_runs()?;
         let held: u64 = self.nodes.borrow().values().map(|node| node.held).sum();
         if limits.memory.is_some_and(|memory| memory < held) {
@@ -367,6 +377,7 @@ impl Servant for MemoryServant {
     }
 
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
+        self.answers().await;
         let nodes = self.nodes.borrow();
         let known = nodes.get(node).ok_or_else(|| Error::NoNode {
             id: self.id.clone(),
@@ -448,6 +459,7 @@ impl Servant for MemoryServant {
     }
 
     async fn stop(&self) -> Result<(), Error> {
+        self.answers().await;
         self.end(ContainerState::Stopped {
             reason: "it was stopped".to_owned(),
         });

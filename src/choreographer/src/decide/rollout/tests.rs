@@ -131,8 +131,9 @@ fn steps_follow_what_was_seen_and_the_time() {
     let mut of = rollout(Some(Share::Robots(1)));
     assert_eq!(step(&of, 9_999_999), Step::Stays, "nobody promotes it");
     of.terms.promote_after = Some(60.0);
-    assert_eq!(step(&of, 61_000), Step::Stays, "it has served nobody");
+    assert_eq!(step(&of, 61_000), Step::Waits(Wait::Servant));
     of.of_candidate.servants = tries(1, 0);
+    of.of_candidate.requests = tries(20, 0);
     assert_eq!(step(&of, 60_999), Step::Stays);
     assert!(matches!(step(&of, 61_000), Step::Promotes(_)));
     of.of_candidate.servants = tries(9, 9);
@@ -150,6 +151,53 @@ fn steps_follow_what_was_seen_and_the_time() {
         of.state = state;
         assert_eq!(step(&of, 99_000), Step::Stays, "{state}");
     }
+}
+
+#[test]
+fn a_canary_is_promoted_once_enough_requests_say_that_it_is_no_worse() {
+    let mut of = rollout(Some(Share::Robots(1)));
+    of.terms.promote_after = Some(60.0);
+    of.of_candidate.servants = tries(1, 0);
+    let requests = |seen| Step::Waits(Wait::Requests { seen, needed: 20 });
+    let promotes = Step::Promotes("it was not worse within 60 s and 20 requests".to_owned());
+    let compares = |failed, seen| {
+        Step::Waits(Wait::Comparison {
+            failed: tries(20, failed),
+            seen,
+            needed: 20,
+        })
+    };
+    for (stable, candidate, expected) in [
+        (tries(0, 0), tries(0, 0), requests(0)),
+        (tries(100, 0), tries(19, 0), requests(19)),
+        (tries(100, 0), tries(20, 0), promotes.clone()),
+        // All robots are given the canary.
+        (tries(0, 0), tries(20, 2), promotes.clone()),
+        (tries(0, 0), tries(20, 3), compares(3, 0)),
+        (tries(19, 19), tries(20, 20), compares(20, 19)),
+        // The stable one fails as often.
+        (tries(20, 20), tries(20, 20), promotes.clone()),
+    ] {
+        of.of_stable = seen(tries(3, 0), stable, 5.0);
+        of.of_candidate.requests = candidate;
+        assert_eq!(step(&of, 61_000), expected, "{stable:?} {candidate:?}");
+    }
+    let words = Wait::Comparison {
+        failed: tries(20, 3),
+        seen: 1,
+        needed: 20,
+    };
+    assert_eq!(
+        words.to_string(),
+        "3 of its 20 requests failed, and the previous revision was asked 1 times of the 20 that are needed to compare them \
+         (--samples)"
+    );
+    assert!(words.is_like(&Wait::Comparison {
+        failed: tries(9, 9),
+        seen: 2,
+        needed: 20
+    }));
+    assert!(!words.is_like(&Wait::Servant));
 }
 
 #[test]

@@ -110,12 +110,21 @@ fn agree(one: &Number, other: &Number, tolerance: f64) -> bool {
     }
 }
 
+/// Whether it is a `std_msgs/Header` of either ROS: that of ROS 2 has no `seq`.
 fn is_header(value: &Value) -> bool {
     let Value::Object(fields) = value else {
         return false;
     };
-    let all = ["seq", "stamp", "frame_id"];
-    fields.len() == all.len() && all.iter().all(|name| fields.contains_key(*name))
+    let is_time = |stamp: &Value| {
+        let parts = stamp.as_object();
+        parts.is_some_and(|parts| parts.len() == 2 && parts.values().all(Value::is_number))
+    };
+    let mut others = fields
+        .keys()
+        .filter(|name| !matches!(&***name, "seq" | "stamp" | "frame_id"));
+    others.next().is_none()
+        && fields.get("stamp").is_some_and(is_time)
+        && fields.contains_key("frame_id")
 }
 
 fn shortened(text: String) -> String {

@@ -13,6 +13,9 @@ fn tolerance(ignore: &[&str]) -> Tolerance {
 #[test]
 fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
     let header = |seq: u32, frame: &str| json!({"seq": seq, "stamp": {"secs": seq, "nsecs": 0}, "frame_id": frame});
+    // Of ROS 2.
+    let header_2 =
+        |sec: u32, frame: &str| json!({"stamp": {"sec": sec, "nanosec": 5}, "frame_id": frame});
     for (present, candidate, ignore, fields) in [
         (json!({"sum": 3}), json!({"sum": 3}), &[][..], &[][..]),
         (json!({"sum": 3}), json!({"sum": 4}), &[], &["sum"]),
@@ -35,6 +38,32 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
             json!({"header": header(1, "odom")}),
             &[],
             &["header.frame_id"],
+        ),
+        (
+            json!({"header": header_2(1, "map"), "x": 1}),
+            json!({"header": header_2(7, "map"), "x": 1}),
+            &[],
+            &[],
+        ),
+        (header_2(1, "map"), header_2(7, "map"), &[], &[]),
+        (
+            json!({"header": header_2(1, "map")}),
+            json!({"header": header_2(1, "odom")}),
+            &[],
+            &["header.frame_id"],
+        ),
+        // Something else of that name is an answer's own.
+        (
+            json!({"stamp": 1, "frame_id": "map"}),
+            json!({"stamp": 7, "frame_id": "map"}),
+            &[],
+            &["stamp"],
+        ),
+        (
+            json!({"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "map", "mark": 1}),
+            json!({"stamp": {"sec": 7, "nanosec": 5}, "frame_id": "map", "mark": 1}),
+            &[],
+            &["stamp.sec"],
         ),
         (
             json!({"all": [{"x": 1, "y": 2}, {"x": 3, "y": 4}]}),

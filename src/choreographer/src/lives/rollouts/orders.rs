@@ -6,19 +6,20 @@ use api::rollout::{RolloutState, RolloutTerms};
 use package::difference::Difference;
 use store::RevisionRecord;
 
-use super::{Inner, Rollout, goes_on, keep};
+use super::{Inner, Rollout, Wait, goes_on, keep};
 use crate::{Choreographer, Error};
 
 /// Differences that are named.
 const NAMED: usize = 8;
 
-fn shown(service: &str, of: &Rollout) -> api::Rollout {
+fn shown(service: &str, of: &Rollout, waits: Option<Wait>) -> api::Rollout {
     api::Rollout {
         service: service.to_owned(),
         stable: of.stable,
         candidate: of.candidate,
         state: of.state,
         reason: of.reason.clone(),
+        waits: waits.map(|wait| wait.to_string()),
         started: of.started,
         changed: of.changed,
         terms: of.terms,
@@ -64,7 +65,10 @@ impl Choreographer {
     pub fn rollout(&self, service: &str) -> Result<api::Rollout, Error> {
         self.inner.catalogue.current(service)?;
         match self.inner.rollout(service) {
-            Some(rollout) => Ok(shown(service, &rollout)),
+            Some(rollout) => {
+                let waits = self.inner.rollout_waits(service);
+                Ok(shown(service, &rollout, waits))
+            }
             None => Err(Error::NoRollout(service.to_owned())),
         }
     }
@@ -169,6 +173,7 @@ impl Choreographer {
         let mut kept = rollouts.kept.lock();
         kept.by_service.remove(service);
         kept.changed.remove(service);
+        kept.waits.remove(service);
     }
 
     fn canary(&self, service: &str) -> Result<Rollout, Error> {

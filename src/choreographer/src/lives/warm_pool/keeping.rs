@@ -7,7 +7,7 @@ use futures_util::FutureExt;
 use futures_util::future::join_all;
 use tokio::time::Instant;
 
-use super::{LEAD, NOBODY, Warm};
+use super::{LEAD, NOBODY, UNMADE, Warm};
 use crate::Error;
 use crate::decide::forecast::INTERVAL;
 use crate::decide::warm_pool::{
@@ -73,8 +73,12 @@ fn runs_ahead(inner: &Inner, revision: &RevisionRecord) -> bool {
     let grants = &revision.plan.grants;
     let holds = !grants.devices.is_empty() || !grants.volumes.is_empty();
     let failing = inner.back_offs.refusal(&revision.service, NOBODY, revision);
+    // Where no container can be made, others' nodes run.
+    let unmade = inner
+        .back_offs
+        .is_failing(&revision.service, UNMADE, revision);
     let shared = revision.plan.shared.is_some();
-    !revision.plan.nodes.is_empty() && !holds && !shared && failing.is_none()
+    !revision.plan.nodes.is_empty() && !holds && !shared && failing.is_none() && !unmade
 }
 
 /// Ends those that are not wanted any more and makes, if so told, those that are missing.
@@ -142,7 +146,11 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
                 break;
             };
             let warm = match nodes_of {
-                None => make(inner, Arc::clone(revision)).await?,
+                // Others are made all the same.
+                None => match make_or_tell(inner, revision).await {
+                    Some(warm) => warm,
+                    None => break,
+                },
                 // Capacity is not there, or somebody took it meanwhile.
                 Some(id) => match heat(inner, &id).await {
                     Some(warm) => warm,
@@ -193,6 +201,32 @@ async fn report_dead(inner: &Inner, warm: &Warm) {
         None,
         &format!("lost {how}"),
     );
+}
+
+/// A container, unless those of its service cannot be made; then that is told, and tried again after a pause.
+async fn make_or_tell(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>) -> Option<Warm> {
+    let (service, back_offs) = (&revision.service, &inner.back_offs);
+    if back_offs.refusal(service, UNMADE, revision).is_some() {
+        return None;
+    }
+    match make(inner, Arc::clone(revision)).await {
+        Ok(warm) => {
+            back_offs.recovered(service, UNMADE);
+            Some(warm)
+        }
+        Err(error) => {
+            let about = NewEvent {
+                service: Some(service),
+                ..NewEvent::default()
+            };
+            let message =
+                format!("no servant of {service} can be made before its robot comes: {error}");
+            inner.journal.warning("warm-failed", &message, &about);
+            let reason = format!("could not be made ahead: {error}");
+            back_offs.failed(service, UNMADE, revision, None, &reason);
+            None
+        }
+    }
 }
 
 async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm, Error> {

@@ -119,6 +119,30 @@ async fn what_is_kept_ready_ends_before_a_robot_waits() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_service_that_cannot_be_made_ahead_keeps_no_other_cold() {
+    let world = World::new();
+    for service in ["a", "greet", "z"] {
+        world.publish(service, "/greet", |_| {});
+    }
+    // In whatever order they are made, there is one before another.
+    for broken in ["a", "z"] {
+        world
+            .engine
+            .breaks(&format!("sha256:{broken}"), "its image is damaged");
+    }
+    let daemon = keeps(&world, 1);
+    pool(&daemon, (1, 1)).await;
+    tokio::time::sleep(SECOND * 600).await;
+    assert_eq!(daemon.warm_pool(), (1, 1));
+    let told = world.told("warm-failed");
+    let words = "can be made before its robot comes: ";
+    assert!(told.iter().all(|it| it.contains(words)), "{told:?}");
+    // Each is tried after pauses that grow.
+    assert!((6..=40).contains(&told.len()), "{}: {told:?}", told.len());
+    assert!(told[0].contains("its image is damaged"), "{told:?}");
+}
+
+#[tokio::test(start_paused = true)]
 async fn whether_one_more_fits_knows_that_what_is_kept_ready_would_end() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});

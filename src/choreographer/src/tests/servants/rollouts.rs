@@ -85,6 +85,64 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
     assert_eq!(world.told("rollout-rolled-back").len(), 1);
 }
 
+/// What the first servant's reach is told by its robot's stub.
+fn hears(daemon: &Choreographer, lease: &Lease) -> Arc<dyn reach::Observer> {
+    let handle = lease.handle();
+    crate::lives::reaching::habits(&daemon.inner, &handle.revision, &handle.id).1
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_canary_that_answers_nothing_is_not_promoted() {
+    use link::control::Request;
+    use reach::links::RequestNews;
+    let world = two();
+    let daemon = keeps(&world);
+    let terms = RolloutTerms {
+        promote_after: Some(0.0),
+        ..canary(Share::Robots(1))
+    };
+    let begun = daemon.begin_rollout("greet", None, 2, terms).await;
+    begun.expect("it begins");
+    let (first, second) = (gets(&daemon, "r1", 2).await, gets(&daemon, "r2", 1).await);
+    let waits = async |words: &str| {
+        tokio::time::sleep(SECOND * 3).await;
+        let shown = daemon.rollout("greet").expect("a rollout");
+        assert_eq!(shown.state, RolloutState::Canary, "{shown:?}");
+        let why = shown.waits.expect("it says why it waits");
+        assert!(why.contains(words), "{why}");
+    };
+    waits("it was asked 0 times and 5 are needed").await;
+    let late = Request::default();
+    let heard = hears(&daemon, &first);
+    (0..4).for_each(|_| heard.measured(&late, RequestNews::Late));
+    waits("it was asked 4 times and 5 are needed").await;
+    heard.measured(&late, RequestNews::Late);
+    waits("5 of its 5 requests failed").await;
+    let told = world.told("rollout-waits");
+    assert_eq!(told.len(), 3, "each reason once: {told:?}");
+    assert!(told[0].contains("no servant of it"), "{told:?}");
+    // The other revision answers: now it is known to be worse.
+    let answered = Request {
+        total: Some(5.0),
+        ..late.clone()
+    };
+    let stable = hears(&daemon, &second);
+    for _ in 0..20 {
+        stable.measured(&answered, RequestNews::Answered);
+        heard.measured(&late, RequestNews::Late);
+    }
+    // Its answers come after all; each request was counted.
+    heard.measured(&answered, RequestNews::AnsweredLate);
+    until(&daemon, RolloutState::RolledBack).await;
+    let shown = daemon.rollout("greet").expect("a rollout");
+    assert_eq!(shown.waits, None);
+    let of = shown.of_candidate;
+    assert_eq!(
+        (of.requests, of.requests_failed, of.p50.is_some()),
+        (25, 25, true)
+    );
+}
+
 #[tokio::test(start_paused = true)]
 async fn robots_without_names_do_not_use_up_the_places_of_a_canary() {
     let world = two();
@@ -150,6 +208,9 @@ async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
         .await
         .expect("it begins");
     let old = gets(&daemon, "r1", 2).await;
+    for _ in 0..5 {
+        daemon.inner.rollouts.note_request("greet", 2, Some(5.0));
+    }
     until(&daemon, RolloutState::Promoted).await;
     drop(gets(&daemon, "r2", 2).await);
     assert_eq!(

@@ -54,7 +54,7 @@ fn link() -> Link {
 }
 
 fn texts(served: Served) -> Vec<(Weight, String)> {
-    causes(&[served], &[], &[])
+    causes(&[served], &[], &[], &[])
         .into_iter()
         .map(|cause| (cause.weight, format!("{}; {}", cause.what, cause.next)))
         .collect()
@@ -172,7 +172,7 @@ fn a_robot_without_a_servant_is_told_what_happened_last() {
         robot: Some("rover".into()),
         message: "the servant ran out of memory".into(),
     };
-    let causes = causes(&[], &[event], &[]);
+    let causes = causes(&[], &[event], &[], &[]);
     assert_eq!(causes[0].weight, Weight::Blocks);
     assert!(causes[0].what.ends_with("the servant ran out of memory"));
 }
@@ -194,7 +194,7 @@ fn what_a_hand_over_has_lost_is_named() {
         event("state-lost", "the cloud goes on without 3 of /scan"),
         event("local-hands-back", "the link is up again"),
     ];
-    let causes = causes(&[], &events, &[]);
+    let causes = causes(&[], &events, &[], &[]);
     let lost: Vec<_> = causes
         .iter()
         .filter(|cause| cause.weight == Weight::Hint)
@@ -317,4 +317,35 @@ fn what_was_never_promised_is_not_late() {
         );
     }
     assert_eq!(causes.len(), 2, "{causes:?}");
+}
+
+#[test]
+fn a_canary_that_waits_is_told_with_what_to_do() {
+    let arm = api::rollout::Arm::default();
+    let rollout = api::Rollout {
+        service: "people".into(),
+        stable: 1,
+        candidate: 2,
+        state: api::rollout::RolloutState::Canary,
+        reason: "the first robot that comes".into(),
+        waits: Some("it was asked 3 times and 20 are needed".into()),
+        started: 0,
+        changed: 0,
+        terms: api::rollout::RolloutTerms::default(),
+        of_stable: arm,
+        of_candidate: arm,
+    };
+    let causes = super::causes(&[served(link())], &[], &[], &[rollout]);
+    let found = causes.iter().find(|cause| cause.what.contains("canary"));
+    let found = found.expect("it is told");
+    assert_eq!(found.weight, Weight::Hint);
+    assert_eq!(
+        found.what,
+        "revision 2 of people, a canary, is not promoted yet: it was asked 3 times and 20 are needed"
+    );
+    assert!(
+        found.next.contains("rollout people promote"),
+        "{}",
+        found.next
+    );
 }

@@ -128,6 +128,7 @@ fn rollout() -> Rollout {
         candidate: 2,
         state: RolloutState::RolledBack,
         reason: "it was worse".into(),
+        waits: some("it was asked 3 times"),
         started: 1,
         changed: 1,
         terms: rollout_terms(),

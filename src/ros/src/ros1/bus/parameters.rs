@@ -1,10 +1,9 @@
 //! The parameters at the Master.
 
 use async_trait::async_trait;
-use tokio::sync::mpsc;
 
 use super::Ros1Bus;
-use crate::bus::{BusError, GlobalParameters, ParamChanges, ParamValue};
+use crate::bus::{BusError, GlobalParameters, ParamChanges, ParamValue, changes_within};
 use crate::ros1::names;
 use crate::ros1::xmlrpc::Value;
 
@@ -56,8 +55,8 @@ impl GlobalParameters for Ros1Bus {
 
     async fn watch(&self) -> Result<ParamChanges, BusError> {
         self.inner.check_open()?;
-        let (sender, changes) = mpsc::unbounded_channel();
-        *self.inner.param_watcher.lock() = Some(sender);
+        let (teller, changes) = changes_within(&self.inner.frames.budget);
+        *self.inner.param_watcher.lock() = Some(teller);
         self.inner.subscribe_params().await?;
         Ok(changes)
     }

@@ -58,7 +58,11 @@ impl Slave {
             value => Some(value.into()),
         };
         if let Some(watcher) = &*self.bus.param_watcher.lock() {
-            let _ = watcher.send((key, value));
+            if let Err(error) = watcher.tell(key.clone(), value) {
+                // Others are told all the same; whoever reads it gets it.
+                tracing::warn!("a change of the parameter {key} is not told: {error}");
+                return Ok(Reply::not_done(error.to_string(), 0));
+            }
         }
         Ok(Reply::done("", 0))
     }

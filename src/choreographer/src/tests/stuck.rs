@@ -1,0 +1,142 @@
+//! Servants whose shims do not answer beside others, told with the engine in memory.
+
+use servant::engine::Servant as _;
+
+use super::servants::World;
+use super::*;
+use crate::options::Hung;
+
+const SECOND: Duration = Duration::from_secs(1);
+/// Of each kind: in whatever order they are looked at, one that is stuck comes before one that is not.
+const EACH: usize = 4;
+
+fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
+    let stated = api::Stated::read(query.iter().copied()).expect("valid");
+    ServantRequest::new("greet", robot).stating(stated)
+}
+
+async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
+    let lease = daemon.ensure(request).expect("a lease");
+    lease.ready().await.expect("ready");
+    lease
+}
+
+fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
+    world.engine.servant(&lease.handle().id).expect("it runs")
+}
+
+/// Robots whose servants answer, and as many whose servants do not from now on.
+async fn robots(
+    world: &World,
+    daemon: &Choreographer,
+    query: &[(&str, &str)],
+) -> (Vec<Lease>, Vec<Lease>) {
+    let (mut sound, mut stuck) = (Vec::new(), Vec::new());
+    for number in 0..EACH {
+        sound.push(ready(daemon, stating(&format!("sound{number}"), query)).await);
+        stuck.push(ready(daemon, stating(&format!("stuck{number}"), query)).await);
+    }
+    for lease in &stuck {
+        container(world, lease).stuck.send_replace(true);
+    }
+    (sound, stuck)
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_clients_stated_that_left_ends_although_other_servants_are_stuck() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    daemon.keep_watch();
+    let by = |lease: &Lease| {
+        let robot = lease.handle().robot.clone();
+        stating(&robot, &[("cpus", "0.2")]).by_stub("/two")
+    };
+    let (sound, stuck) = robots(&world, &daemon, &[("cpus", "0.1")]).await;
+    let mut second = Vec::new();
+    for lease in &stuck {
+        container(&world, lease).stuck.send_replace(false);
+    }
+    for lease in sound.iter().chain(&stuck) {
+        second.push(ready(&daemon, by(lease)).await);
+    }
+    for lease in &stuck {
+        container(&world, lease).stuck.send_replace(true);
+    }
+    drop(second);
+    tokio::time::sleep(daemon.inner.options.grace + SECOND * 3).await;
+    let cpus = |lease: &Lease| container(&world, lease).enforced().limits.cpus;
+    for lease in &sound {
+        assert_eq!(cpus(lease), Some(0.1), "{}", lease.handle().robot);
+    }
+    for lease in &stuck {
+        assert_eq!(cpus(lease), Some(0.2), "{}", lease.handle().robot);
+        container(&world, lease).stuck.send_replace(false);
+    }
+    // They are given it as soon as they answer.
+    tokio::time::sleep(SECOND).await;
+    for lease in &stuck {
+        assert_eq!(cpus(lease), Some(0.1), "{}", lease.handle().robot);
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn nodes_that_hang_are_ended_although_other_servants_are_stuck() {
+    let world = World::new();
+    world.publish("greet", "/greet", |record| record.plan.restart = true);
+    let daemon = world.daemon_with(|options| {
+        (options.hung, options.hung_after) = (Hung::Restart, 5.0);
+    });
+    daemon.watch_nodes();
+    let query = [("cpus", "0.1"), ("max_rrt", "300ms")];
+    let (sound, stuck) = robots(&world, &daemon, &query).await;
+    let all = || sound.iter().chain(&stuck);
+    for lease in all() {
+        *container(&world, lease).flow.lock() = (1, 1);
+    }
+    for _ in 0..10 {
+        tokio::time::sleep(SECOND).await;
+        for lease in all() {
+            container(&world, lease).flow.lock().0 += 10;
+        }
+    }
+    assert_eq!(world.told("node-hung").len(), 2 * EACH);
+    assert_eq!(
+        world.told("node-failed").len(),
+        EACH,
+        "each that answers was ended"
+    );
+    // A servant that does not answer is told of, and watched as before.
+    for lease in &stuck {
+        container(&world, lease).stuck.send_replace(false);
+    }
+    tokio::time::sleep(SECOND).await;
+    assert_eq!(world.told("node-failed").len(), 2 * EACH);
+}
+
+#[tokio::test(start_paused = true)]
+async fn cores_are_moved_although_other_servants_are_stuck() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let daemon = world.daemon();
+    daemon.keep_watch();
+    let near = [("cpus", "0.02"), ("max_rrt", "100ms")];
+    let (sound, stuck) = robots(&world, &daemon, &near).await;
+    let takes = |lease: &Lease| {
+        let handle = lease.handle();
+        let inner = &daemon.inner;
+        let measures = crate::lives::reaching::Measures::of(inner, &handle.revision, &handle.id);
+        for _ in 0..3 {
+            measures.called().tell(Some(Duration::from_millis(95)));
+        }
+    };
+    let moved = |lease: &Lease| container(&world, lease).enforced().limits.cpus > Some(0.02);
+    // Each second there is a look; one that does not answer is waited for five.
+    let mut seconds = 0;
+    while !sound.iter().all(moved) {
+        assert!(seconds < 5, "they wait for those that are stuck");
+        seconds += 1;
+        sound.iter().chain(&stuck).for_each(takes);
+        tokio::time::sleep(SECOND).await;
+    }
+}
