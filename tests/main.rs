@@ -368,7 +368,10 @@ fn main() -> ExitCode {
             a_stub_is_installed_and_paired_by_one_line,
         ],
         of_both![farewells: a_stub_ends_beside_a_daemon_that_is_frozen_or_killed],
-        stories![patience: a_node_that_waits_is_seen_whole_and_driven_by_its_robot],
+        stories![patience:
+            a_node_that_waits_is_seen_whole_and_driven_by_its_robot,
+            a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way,
+        ],
         of_both![cuts: no_request_is_lost_or_answered_twice_however_often_the_link_is_cut],
         stories![link:
             a_greeter_in_the_cloud_is_a_node_of_the_robot,

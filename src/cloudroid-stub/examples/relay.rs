@@ -1,6 +1,8 @@
 //! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting before it; `~echo` answers with its request.
-//! `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` comes, what that service answers leaves. `patient`: it
-//! listens once it is heard. `keeps`: it wants what was said before, too.
+//! `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` or `get PARAMETER` comes, what that
+//! service answers or the parameter's value leaves. `patient`: it
+//! listens once it is heard. `keeps`: it wants what was said before, too. `awaits=TOPIC`, `awaits-latched=TOPIC`: it listens once it
+//! has heard something there.
 //!
 //! In ROS 1 the greeting is a sibling's parameter. With `--ros-args` it is a node of ROS 2, the greeting is a parameter of its own,
 //! and there is an action, `count`, whose goals are their results.
@@ -167,6 +169,14 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     if arguments.iter().any(|argument| argument == "patient") {
         out.matched().wait_for(|now| now.connected() > 0).await?;
     }
+    for (prefix, is_latched) in [("awaits=", false), ("awaits-latched=", true)] {
+        let awaited = arguments.iter().find_map(|it| it.strip_prefix(prefix));
+        if let Some(awaited) = awaited {
+            let qos = Qos::keep_last(8).latching(is_latched);
+            let mut heard = bus.subscribe(awaited, wire_type.clone(), qos).await?;
+            heard.messages.recv().await;
+        }
+    }
     let keeps = arguments.iter().any(|argument| argument == "keeps");
     let qos = Qos::keep_last(8).latching(keeps);
     let mut input = bus.subscribe(&topic("in"), wire_type, qos).await?;
@@ -179,9 +189,13 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
                 if crash == Some(text.as_str()) {
                     std::process::exit(3);
                 }
-                let text = match text.strip_prefix("ask ") {
-                    Some(service) => asked(&*bus, service).await,
-                    None => format!("{greeting}{text}"),
+                let text = match text.split_once(' ') {
+                    Some(("ask", service)) => asked(&*bus, service).await,
+                    Some(("get", parameter)) => match bus.parameter(parameter).await {
+                        Ok(value) => format!("{value:?}"),
+                        Err(error) => error.to_string(),
+                    },
+                    _ => format!("{greeting}{text}"),
                 };
                 out.publish(written(&*bus, &text)?);
             }

@@ -2,7 +2,7 @@
 
 use std::io;
 use std::net::IpAddr;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use nix::sys::socket::{getsockopt, sockopt::IpMtu};
 use tls::{Fingerprint, Trust};
@@ -25,6 +25,8 @@ pub struct Answer {
     pub body: Vec<u8>,
     /// From the request to the first byte of the answer.
     pub waited: Duration,
+    /// When that came, by this machine's clock: the connection may end much later.
+    pub arrived: SystemTime,
     /// The path's MTU as the kernel knows it, where it does.
     pub mtu: Option<i32>,
 }
@@ -108,7 +110,7 @@ async fn exchange(
         return Err(said.unwrap_or(error));
     }
     stream.read_exact(&mut first).await?;
-    let waited = began.elapsed();
+    let (waited, arrived) = (began.elapsed(), SystemTime::now());
     let mtu = getsockopt(stream.tcp(), IpMtu).ok();
     let mut answer = first.to_vec();
     match stream.take(LONGEST).read_to_end(&mut answer).await {
@@ -123,6 +125,7 @@ async fn exchange(
         status,
         body,
         waited,
+        arrived,
         mtu,
     })
 }
@@ -179,7 +182,41 @@ fn without_chunks(mut body: &[u8]) -> Option<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
+    use tokio::net::TcpListener;
+
     use super::*;
+
+    /// Answers one connection, keeps it open for a while, and says when it closed it.
+    async fn closes_late(listener: TcpListener) -> SystemTime {
+        let (mut stream, _) = listener.accept().await.unwrap();
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            head.push(stream.read_u8().await.unwrap());
+        }
+        let answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok";
+        stream.write_all(answer).await.unwrap();
+        // Nothing tells the server that its answer was read.
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        SystemTime::now()
+    }
+
+    #[tokio::test]
+    async fn an_answer_arrives_before_its_connection_ends() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let settings = format!("server = 'ws://{address}'\nservice = 'any'");
+        let config: crate::config::Config = toml::from_str(&settings).unwrap();
+        let server = Server {
+            address: config.address().unwrap(),
+            ip: address.ip(),
+            trust: config.trust().unwrap(),
+            only: None,
+        };
+        let (answer, closed) = tokio::join!(get(&server, "/", None), closes_late(listener));
+        let answer = answer.unwrap();
+        assert_eq!(answer.body, b"ok");
+        assert!(answer.arrived < closed);
+    }
 
     #[test]
     fn answers_are_understood_whole_or_in_chunks() {

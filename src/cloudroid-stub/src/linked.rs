@@ -33,12 +33,27 @@ const SERVANT: Duration = Duration::from_secs(120);
 const WELCOME: Duration = Duration::from_secs(5);
 /// Between the beginnings of two attempts, at first.
 const PAUSE: Duration = Duration::from_millis(50);
-/// The longest such pause while no server is reached.
-const AWAY: Duration = Duration::from_secs(1);
-/// The longest such pause while the server says that it has no capacity.
-const BUSY: Duration = Duration::from_secs(3);
+/// The longest pauses between the beginnings of two attempts.
+const PAUSES: Pauses = Pauses {
+    away: Duration::from_secs(1),
+    busy: Duration::from_secs(3),
+    refused: Duration::from_secs(60),
+    stood: Duration::from_secs(10),
+};
 /// After a link has fallen silent, until another connection is tried beside it.
 const STANDBY: Duration = Duration::from_secs(1);
+
+/// How long the pauses between attempts become.
+struct Pauses {
+    /// While no server is reached.
+    away: Duration,
+    /// While the server says that it has no capacity.
+    busy: Duration,
+    /// While the server refuses a stub whose link it had accepted before: from the first such pause on.
+    refused: Duration,
+    /// A link that stood for so long is tried again at once when it is lost. One that did not may be accepted and lost again and again.
+    stood: Duration,
+}
 
 /// How a connection ended that had carried the link.
 enum End {
@@ -47,13 +62,24 @@ enum End {
     Replaced(Box<WebSocket<Stream>>),
 }
 
-/// Keeps a link until the cloud refuses it, or this side ends it; says why.
+/// Keeps a link until the cloud refuses its first connection, or this side ends it; says why. What was accepted once may be refused for a
+/// while, by a proxy before the server or while an operator works there, and the robot's nodes go on meanwhile.
 pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
+    keep_with(config, mirror, hello, &PAUSES).await
+}
+
+async fn keep_with(
+    config: &Config,
+    mirror: &Arc<Mirror>,
+    hello: &mut Hello,
+    pauses: &Pauses,
+) -> String {
     let mut link = Link {
         config,
         mirror,
         hello,
         session: None,
+        since: None,
         welcome: WELCOME,
         unmet: None,
     };
@@ -71,8 +97,7 @@ pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> S
             Ok(End::Lost(lost)) => {
                 tracing::warn!("the link to {} was lost: {lost}", config.server);
                 told.clear();
-                pace = Pace::default();
-                pace.begin();
+                pace.lost(link.since, pauses);
                 None
             }
             Ok(End::Replaced(socket)) => {
@@ -84,14 +109,26 @@ pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> S
                 standby = Some(socket);
                 continue;
             }
-            Err(connect::Error::Refused(reason)) => return reason,
-            Err(connect::Error::Unreachable(reason)) => Some((reason, AWAY)),
-            Err(connect::Error::Busy(reason)) => Some((reason, BUSY)),
+            Err(connect::Error::Refused(reason)) if link.session.is_none() => return reason,
+            Err(connect::Error::Refused(reason)) => {
+                pace.pause = pauses.refused;
+                let again = format!(
+                    "the server has accepted this node before: it is asked again about every {:?}",
+                    pauses.refused
+                );
+                Some((format!("{reason}; {again}"), pauses.refused))
+            }
+            Err(connect::Error::Unreachable(reason)) => {
+                Some((format!("{reason}; trying again"), pauses.away))
+            }
+            Err(connect::Error::Busy(reason)) => {
+                Some((format!("{reason}; trying again"), pauses.busy))
+            }
         };
-        let longest = reason.as_ref().map_or(AWAY, |(_, longest)| *longest);
+        let longest = reason.as_ref().map_or(pauses.away, |(_, longest)| *longest);
         if let Some((reason, _)) = reason {
             if reason != told {
-                tracing::warn!("no link: {reason}; trying again");
+                tracing::warn!("no link: {reason}");
                 told = reason;
             }
         }
@@ -119,6 +156,13 @@ impl Pace {
         self.began = Instant::now();
     }
 
+    /// A link that was accepted then is lost.
+    fn lost(&mut self, since: Option<Instant>, pauses: &Pauses) {
+        if since.is_some_and(|since| since.elapsed() >= pauses.stood) {
+            *self = Self::default();
+        }
+    }
+
     /// Until the next attempt: with jitter, or all robots of a server come at once when it is back.
     async fn wait(&mut self, longest: Duration) {
         let pause = self.pause.min(longest);
@@ -136,6 +180,8 @@ struct Link<'a> {
     hello: &'a mut Hello,
     /// As the last welcome named it.
     session: Option<String>,
+    /// When that came.
+    since: Option<Instant>,
     /// How long a welcome may take when the link is taken up again.
     welcome: Duration,
     /// What was said of the codec that the configuration asks for.
@@ -214,6 +260,7 @@ impl Link<'_> {
                     self.mirror.renew(fresh);
                 }
                 self.session = Some(session);
+                self.since = Some(Instant::now());
                 tracing::info!(servant, resumed, "linked to {}", self.config.server);
                 let session = self.mirror.session();
                 if self.config.codec != config::Codec::None {
@@ -266,3 +313,6 @@ async fn standby(config: &Config, node: &str, session: &RobotSession) -> WebSock
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

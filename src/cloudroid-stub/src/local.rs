@@ -17,6 +17,7 @@ mod private_domain;
 mod private_master;
 mod private_system;
 mod process;
+mod reconfigured;
 mod remembered;
 mod service_use;
 mod stamp;

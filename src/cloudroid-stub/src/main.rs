@@ -26,6 +26,7 @@ mod machine;
 mod mirror;
 mod network;
 mod original;
+mod output;
 mod pairing;
 mod parameters;
 mod params_file;
@@ -50,7 +51,7 @@ fn main() -> ExitCode {
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr)
+        .with_writer(|| &*output::STDERR)
         .with_target(false)
         .init();
     // One machine has one clock: tests of two need this.
@@ -66,10 +67,12 @@ fn main() -> ExitCode {
         Verb::Doctor(asked) => doctor::examine(&asked),
         Verb::Pair(asked) => pairing::pair(&asked),
     };
-    outcome.unwrap_or_else(|error| {
+    let exit = outcome.unwrap_or_else(|error| {
         // It may have words of a server.
         let text = format!("cloudroid-stub: {error:#}");
-        eprintln!("{}", terminal::escape(&text, false));
+        output::STDERR.print(format!("{}\n", terminal::escape(&text, false)));
         ExitCode::FAILURE
-    })
+    });
+    output::finish();
+    exit
 }

@@ -39,6 +39,7 @@ use parking_lot::{Mutex, RwLock};
 use ros::bus::{Bus, NodeNames, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
 
+use crate::output;
 use calls::Calls;
 use inputs::Inputs;
 use lent::LentServices;
@@ -57,7 +58,7 @@ pub struct Mirror {
     bus: Arc<dyn Bus>,
     /// By which stubs of one servant know each other.
     label: String,
-    session: RwLock<Arc<RobotSession>>,
+    session: watch::Sender<Arc<RobotSession>>,
     inputs: Inputs,
     outputs: Outputs,
     calls: Calls,
@@ -93,7 +94,7 @@ impl Mirror {
             this: this.clone(),
             bus,
             label,
-            session: RwLock::new(session),
+            session: watch::Sender::new(session),
             inputs: Inputs::default(),
             outputs: Outputs::default(),
             calls: Calls::default(),
@@ -121,6 +122,11 @@ impl Mirror {
         self.exit.subscribe()
     }
 
+    /// The session in use, as it is replaced.
+    pub fn sessions(&self) -> watch::Receiver<Arc<RobotSession>> {
+        self.session.subscribe()
+    }
+
     /// All parameters of the robot, and from now on their changes go to the cloud.
     pub async fn parameters(self: &Arc<Self>) -> BTreeMap<String, ParamValue> {
         parameters::begin(self).await
@@ -128,14 +134,14 @@ impl Mirror {
 
     /// The session in use.
     pub fn session(&self) -> Arc<RobotSession> {
-        self.session.read().clone()
+        self.session.borrow().clone()
     }
 
     /// Another session takes the place of the one that was lost: calls under way have failed, and what the node
     /// listens to is opened again.
     pub fn renew(&self, session: Arc<RobotSession>) {
         self.calls.renew();
-        let before = std::mem::replace(&mut *self.session.write(), session);
+        let before = self.session.send_replace(session);
         for drop in before.drops() {
             self.drops.add(&drop.topic, drop.cause, drop.count);
         }
@@ -219,10 +225,10 @@ impl Handler<FromCloud> for Mirror {
             ),
             // A server that is not to be trusted could have the robot's terminal do what it likes.
             Record::Control(FromCloud::Line { error: true, text }) => {
-                eprintln!("{}", terminal::escape(&text, true));
+                output::STDERR.print(format!("{}\n", terminal::escape(&text, true)));
             }
             Record::Control(FromCloud::Line { text, .. }) => {
-                println!("{}", terminal::escape(&text, true));
+                output::STDOUT.print(format!("{}\n", terminal::escape(&text, true)));
             }
             Record::Control(FromCloud::Lookup { service }) => {
                 self.lent.look_up(self, service, held);

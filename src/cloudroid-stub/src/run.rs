@@ -33,6 +33,7 @@ use crate::machine;
 use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::{Mirror, promise};
 use crate::original;
+use crate::output;
 use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
@@ -40,6 +41,10 @@ use crate::robot::{Place, Robot, Usual, usual_name};
 
 /// Where no T_max is given, a link silent for so long counts as down.
 const SILENT: Duration = Duration::from_secs(2);
+
+/// How long a local original may take to listen to its requests: a model may be loaded before, or a transform be awaited that does
+/// not come.
+const READY: Duration = Duration::from_secs(60);
 
 /// How it ends.
 enum End {
@@ -75,10 +80,14 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
     runtime.shutdown_background();
     match end {
         End::Asked => Ok(ExitCode::SUCCESS),
-        End::Node(exit) => Ok(exit_as(&exit)),
+        End::Node(exit) => {
+            output::finish();
+            Ok(exit_as(&exit))
+        }
         End::Refused(reason) => {
             if config.local != Local::None {
                 tracing::error!("{reason}; running the local original instead");
+                output::finish();
                 return original::exec(&asked.node, &asked.argv);
             }
             bail!("{reason}")
@@ -294,6 +303,7 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
         }),
         node: robot.node.clone(),
         domain,
+        patience: READY,
     }
 }
 

@@ -1,7 +1,7 @@
 //! The server's side: is it reached, does it know the token and the service, does its clock agree, do big answers
 //! come through.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, UNIX_EPOCH};
 
 use serde_json::Value;
 
@@ -164,7 +164,9 @@ impl Portal {
             let Ok(answer) = self.get("/api/v1/clock").await else {
                 continue;
             };
-            let here = now() - answer.waited.as_secs_f64() / 2.0;
+            let since = answer.arrived.duration_since(UNIX_EPOCH);
+            let here = since.map_or(0.0, |since| since.as_secs_f64());
+            let here = here - answer.waited.as_secs_f64() / 2.0;
             let body: Value = serde_json::from_slice(&answer.body).unwrap_or_default();
             let Some(there) = body["now"].as_f64() else {
                 continue;
@@ -214,12 +216,6 @@ impl Portal {
             ),
         }
     }
-}
-
-fn now() -> f64 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0.0, |since| since.as_secs_f64())
 }
 
 fn millis(time: Duration) -> f64 {

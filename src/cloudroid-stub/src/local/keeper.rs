@@ -1,9 +1,12 @@
 //! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
 //! the application.
 
+mod context;
 mod effects;
 mod goal_messages;
 mod goals;
+mod inputs;
+mod kept;
 mod managing;
 
 use std::collections::HashMap;
@@ -18,14 +21,16 @@ use qos::{
     Event, Failure, Governor, HandOver, Ledger, Limits, LocalState, Mode, Outcome, Pair, Phases,
     RequestId, SafeStop, Side, Sla, Verdict,
 };
-use ros::bus::{Message, PeerId, WireType};
+use ros::bus::{Message, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
 use super::original::{Interface, News, Original};
 use super::remembered::Remembered;
 use super::stamp::{Stamps, age};
+use context::Context;
 use goals::Goals;
+use kept::{KeptInput, KeptInputs};
 
 /// The way to the servant.
 pub trait Cloud: Send + Sync + 'static {
@@ -52,6 +57,8 @@ pub trait Application: Send + Sync + 'static {
     fn decided(&self, event: &Event);
     /// A stateful service: who goes on, and without what.
     fn handed_over(&self, over: &HandOver);
+    /// The side that goes on was not given these calls and goals, of a service that is not stateful: most lose nothing by that.
+    fn lacks(&self, over: &HandOver);
     /// How a request went.
     fn told(&self, outcome: &Outcome);
 }
@@ -60,7 +67,7 @@ pub trait Application: Send + Sync + 'static {
 #[derive(Debug, Clone)]
 pub enum Payload {
     /// An input message.
-    Input(Message),
+    Input(Arc<KeptInput>),
     /// A serialized service request.
     Call(Bytes),
     /// A goal of an action that is made of calls (ROS 2).
@@ -86,9 +93,12 @@ pub struct Keeper {
 
 struct State {
     governor: Governor<Payload>,
+    context: Context,
+    kept: KeptInputs,
     stamps: Stamps,
-    /// Of a stateful service: what each side was given.
-    ledger: Option<Ledger>,
+    /// What each side was given: of a stateful service all, of any other the calls and goals, each of which may switch how a node behaves.
+    ledger: Ledger,
+    is_stateful: bool,
     /// What was lost at the last hand-over.
     lost: Option<(Instant, String)>,
     callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
@@ -108,10 +118,12 @@ impl Keeper {
         let (original, news) = original.unzip();
         let promised = !sla.is_of_link();
         let safe_stop = sla.safe_stop.clone();
-        let ledger = (sla.mode == Mode::Stateful).then(Ledger::default);
         let state = State {
-            ledger,
+            ledger: Ledger::default(),
+            is_stateful: sla.mode == Mode::Stateful,
             lost: None,
+            context: Context::of(&pairs),
+            kept: KeptInputs::default(),
             governor: Governor::new(sla, pairs, Limits::default()),
             stamps: Stamps::default(),
             callers: HashMap::new(),
@@ -142,7 +154,10 @@ impl Keeper {
 
     /// More of the interface has become known.
     pub async fn learn(&self, pairs: Vec<Pair>, interface: Interface) -> anyhow::Result<()> {
-        self.with(|state, now| state.governor.learn(now, pairs));
+        self.with(|state, now| {
+            state.context.learn(&pairs);
+            state.governor.learn(now, pairs);
+        });
         match &self.original {
             Some(original) => original.adapt(interface).await,
             None => Ok(()),
@@ -176,53 +191,6 @@ impl Keeper {
         self.with(|state, now| state.governor.wanted(now, output, wanted));
     }
 
-    /// The application published an input. What is latched is for both sides, whoever answers now: one that begins later
-    /// needs it, too.
-    pub fn input(&self, topic: &Arc<str>, message: Message) {
-        if message.latching {
-            self.cloud.publish(topic, &message);
-            if let Some(original) = &self.original {
-                original.latch(topic, &message);
-            }
-        }
-        self.with(|state, now| {
-            if let Some(ledger) = state.ledger.as_mut().filter(|_| !message.latching) {
-                ledger.told(now, topic);
-            }
-            let key = state.stamps.key(&message);
-            state
-                .governor
-                .input(now, topic, key, Payload::Input(message));
-        });
-    }
-
-    /// The application published an input that the cloud has by another way: nodes of one servant hear each other inside,
-    /// and one of them takes up what several listen to.
-    pub fn overheard(&self, topic: &Arc<str>, message: Message) {
-        if let Some(original) = self.original.as_ref().filter(|_| message.latching) {
-            return original.latch(topic, &message);
-        }
-        self.with(|state, now| {
-            let has = state.governor.sides().cloud;
-            if let Some(ledger) = &mut state.ledger {
-                ledger.told(now, topic);
-                if has {
-                    ledger.given(Side::Cloud, topic);
-                }
-            }
-            state
-                .governor
-                .overheard(now, topic, Payload::Input(message));
-        });
-    }
-
-    /// A publisher of the robot has gone, and with it what it has latched on this topic.
-    pub fn left(&self, topic: &Arc<str>, publisher: &PeerId) {
-        if let Some(original) = &self.original {
-            original.unlatch(topic, publisher);
-        }
-    }
-
     /// The application calls a service. When the caller goes, so does the request.
     pub async fn call(
         self: &Arc<Self>,
@@ -231,9 +199,7 @@ impl Keeper {
     ) -> Result<Bytes, String> {
         let (sender, answer) = oneshot::channel();
         let id = self.with(|state, now| {
-            if let Some(ledger) = &mut state.ledger {
-                ledger.told(now, service);
-            }
+            state.ledger.told(now, service);
             let id = state.governor.call(now, service, Payload::Call(request));
             state.callers.insert(id, sender);
             id
@@ -262,9 +228,7 @@ impl Keeper {
     /// The link is up; `resumed`: what was sent will be answered yet.
     pub fn link_up(&self, resumed: bool) {
         self.with(|state, now| {
-            if let Some(ledger) = &mut state.ledger {
-                ledger.link_up(resumed);
-            }
+            state.ledger.link_up(resumed);
             state.governor.link_up(now, resumed);
         });
         self.tell_cloud(resumed);
@@ -397,7 +361,10 @@ async fn listen(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<News>) {
             return;
         };
         match news {
-            News::State(local) => keeper.with(|state, now| state.governor.local(now, local)),
+            News::State(local) => keeper.with(|state, now| {
+                state.context.is_now(local);
+                state.governor.local(now, local);
+            }),
             News::Crashed(reason) => {
                 keeper.with(|state, now| state.governor.local_crashed(now, &reason))
             }

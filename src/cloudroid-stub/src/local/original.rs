@@ -1,45 +1,44 @@
 //! The local original as its user sees it: start, stop, feed, call; its state and its outputs come back.
 //!
 //! ```text
-//!             start              registered, inputs subscribed to
+//!             start          registered, listens to its requests
 //!  Stopped ──────────▶ Starting ──────────────────────────────────▶ Ready
 //!     ▲                   ▲  └─────────────── crash ◀────────────────┤
 //!     │                   └── after a pause, doubled each time ◀┘    │
 //!     └──────────────────────────── stop ◀────────────────────────────┘
 //! ```
 
+mod runner;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Failure, LocalState};
 use ros::bus::{
-    Bus, BusError, Matched, Message, PeerId, Publisher, Qos, Reliability, WireType, reaches,
+    Bus, BusError, Matched, Message, ParamValue, PeerId, Publisher, Qos, Reliability, WireType,
+    reaches,
 };
-use tokio::process::Child;
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
-use tokio::time::{sleep, timeout};
+use tokio::time::timeout;
 
 use super::keeper::Answer;
 use super::latched::Latched;
 use super::private_system::{Changes, PrivateSystem, Registered};
-use super::process::{self, Program};
+use super::process::Program;
 use super::remembered::Remembered;
-use crate::seen;
+use runner::Runner;
 
 /// Messages kept per topic: what waits longer is old.
 pub const QUEUE: usize = 16;
+/// Longer than any call of a local service is waited for.
+const CALL: Duration = Duration::from_secs(24 * 3600);
 /// How long the original may take to register all of the interface once its node is registered; another version of it may
 /// lack a part.
 const SETTLE: Duration = Duration::from_secs(3);
-/// Longer than any call of a local service is waited for.
-const CALL: Duration = Duration::from_secs(24 * 3600);
-/// Pauses after crashes, at first and at last; and how long a life forgives them.
-const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
-const FORGIVEN: Duration = Duration::from_secs(30);
 
 /// What the original needs.
 #[derive(Debug, Clone)]
@@ -50,17 +49,20 @@ pub struct Setting {
     pub node: String,
     /// The domain of the robot's nodes (ROS 2), which is not the original's.
     pub domain: Option<u16>,
+    /// How long it may take to listen to its requests once its node is registered. What it waits for may never come; then it is
+    /// given them all the same.
+    pub patience: Duration,
 }
 
-/// What is known of the node's interface. It is ready when it listens to what it is waited for, and has registered the
-/// rest or has had time to.
+/// What is known of the node's interface. It is ready when it listens to its requests, and has registered the rest or has had
+/// time to. What it may itself wait for before it listens to requests is given to it from its first moment ([`Keeper`](super::Keeper)).
 #[derive(Debug, Clone, Default)]
 pub struct Interface {
     /// What it listens to.
     pub inputs: BTreeMap<String, WireType>,
     /// What it asks for of inputs, where that is told (ROS 2).
     pub asked: BTreeMap<String, Qos>,
-    /// Of the inputs, those that it must listen to before it is given anything.
+    /// Of the inputs, its requests: it listens to them before it is ready.
     pub awaited: BTreeSet<String>,
     /// What it publishes.
     pub outputs: Vec<String>,
@@ -77,7 +79,7 @@ impl Interface {
         self.awaited.contains(name) || !self.of_others.contains(name)
     }
 
-    /// Whether it is given nothing before it listens to this, however long that takes.
+    /// Whether it is not ready before it listens to this, as long as that may take.
     fn must_listen_to(&self, topic: &str) -> bool {
         self.awaited.contains(topic) && !self.of_others.contains(topic)
     }
@@ -260,6 +262,14 @@ impl Original {
         self.latched.forget(topic, publisher);
     }
 
+    /// A parameter of the robot has changed, or was deleted: nodes of ROS 1 share them. Those of a process are the robot's when it
+    /// starts; this is for one that runs.
+    pub async fn change_parameter(&self, name: &str, value: Option<ParamValue>) {
+        if let Err(error) = self.system.change_parameter(name, value).await {
+            tracing::debug!(name, %error, "the local original is not told of a parameter");
+        }
+    }
+
     /// Starts the process, if it does not run.
     pub fn start(&self) {
         let _ = self.orders.send(Order::Start);
@@ -335,122 +345,4 @@ fn offered(asked: Option<&Qos>) -> Qos {
         depth: QUEUE,
         ..*asked
     })
-}
-
-struct Runner {
-    setting: Setting,
-    system: Arc<PrivateSystem>,
-    robot: Arc<dyn Bus>,
-    publishers: Publishers,
-    sources: Sources,
-    expected: Expected,
-    remembered: Arc<Remembered>,
-    news: mpsc::UnboundedSender<News>,
-}
-
-impl Runner {
-    async fn run(self, mut orders: mpsc::UnboundedReceiver<Order>) {
-        while let Some(order) = orders.recv().await {
-            if matches!(order, Order::Start) {
-                let Some(program) = &self.setting.program else {
-                    self.report(LocalState::Missing);
-                    continue;
-                };
-                self.live(program, &mut orders).await;
-                self.report(LocalState::Stopped);
-            }
-        }
-    }
-
-    /// From start to stop, through all crashes.
-    async fn live(&self, program: &Program, orders: &mut mpsc::UnboundedReceiver<Order>) {
-        let mut pause = BACKOFF.0;
-        loop {
-            let born = Instant::now();
-            self.report(LocalState::Starting);
-            let reason = match self.spawn(program).await {
-                Ok(mut child) => tokio::select! {
-                    reason = self.watch(&mut child) => reason,
-                    () = stopped(orders) => {
-                        process::end(&mut child).await;
-                        self.system.process_exited(&self.setting.node).await;
-                        return;
-                    }
-                },
-                Err(error) => format!("{error:#}"),
-            };
-            self.system.process_exited(&self.setting.node).await;
-            let _ = self.news.send(News::Crashed(reason));
-            if born.elapsed() > FORGIVEN {
-                pause = BACKOFF.0;
-            }
-            tokio::select! {
-                () = sleep(pause) => {}
-                () = stopped(orders) => return,
-            }
-            pause = (pause * 2).min(BACKOFF.1);
-        }
-    }
-
-    async fn spawn(&self, program: &Program) -> anyhow::Result<Child> {
-        // They may have changed since the last start.
-        self.system.copy_parameters(&*self.robot).await?;
-        program.spawn(&self.system.environment())
-    }
-
-    /// Tells when it is ready; gives the reason when it ends.
-    async fn watch(&self, child: &mut Child) -> String {
-        tokio::select! {
-            status = child.wait() => return process::ended(status),
-            () = self.ready() => self.report(LocalState::Ready),
-        }
-        process::ended(child.wait().await)
-    }
-
-    /// Its node is registered, listens to its inputs, and what it publishes is heard.
-    async fn ready(&self) {
-        let node = &self.setting.node;
-        self.system.registered(node).await;
-        let expected = self.expected.lock().clone();
-        let _ = timeout(SETTLE, self.system.registers(node, &expected)).await;
-        let graph = self.system.graph();
-        let nodes = self.system.nodes_of(&graph, node);
-        let listens = |topic: &String| {
-            let mut nodes = nodes.iter();
-            nodes.any(|node| seen::subscribes(&graph, node, topic))
-        };
-        let ends: Vec<_> = {
-            let inputs = self.publishers.lock();
-            let due = inputs
-                .iter()
-                .filter(|(topic, _)| expected.must_listen_to(topic) || listens(topic));
-            due.map(|(_, input)| input.matched()).collect()
-        };
-        for end in ends {
-            reaches(end, 1).await;
-        }
-        let sources = self.sources.lock().clone();
-        for (topic, source) in sources {
-            let mut nodes = nodes.iter();
-            if nodes.any(|node| seen::publishes(&graph, node, &topic)) {
-                reaches(source, 1).await;
-            }
-        }
-        let bus = self.system.bus();
-        let ask = |service: &str, request| call(bus.clone(), service, request);
-        self.remembered.tell(ask).await;
-    }
-
-    fn report(&self, state: LocalState) {
-        let _ = self.news.send(News::State(state));
-    }
-}
-
-/// Waits for the order to stop, or for nobody being left to give it.
-async fn stopped(orders: &mut mpsc::UnboundedReceiver<Order>) {
-    while let Some(order) = orders.recv().await {
-        if matches!(order, Order::Stop) {
-            return;
-        }
-    }
 }

@@ -7,7 +7,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ros::bus::{Bus, Graph, NodeNames, Qos, RosVersion, ServiceType, WireType};
+use ros::bus::{
+    Bus, BusError, Graph, NodeNames, ParamValue, Qos, RosVersion, ServiceType, WireType,
+};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -120,6 +122,19 @@ impl PrivateSystem {
         match &self.place {
             Place::Master(master) => master.copy_parameters(from).await,
             Place::Domain(_) => Ok(()),
+        }
+    }
+
+    /// A parameter that nodes of the robot share has changed, or was deleted.
+    pub async fn change_parameter(
+        &self,
+        name: &str,
+        value: Option<ParamValue>,
+    ) -> Result<(), BusError> {
+        let parameters = self.bus.parameters()?;
+        match value {
+            Some(value) => parameters.set(name, value).await,
+            None => parameters.delete(name).await,
         }
     }
 

@@ -1,35 +1,67 @@
-//! What a node of ROS 2 was told to be: its parameters and the state of its life. One side was told, and the other one is when it
+//! What a node was told to be: its parameters (of ROS 1 by dynamic_reconfigure) and the state of its life (ROS 2). One side was told, and the other one is when it
 //! begins: a new process of the local original, or another servant.
 
+use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use tokio::sync::OwnedMutexGuard;
 use tokio::time::timeout;
 
 use super::keeper::Answer;
+use super::reconfigured;
 use super::service_use::ServiceUse;
 
 /// Requests that are kept; a slider that sets one parameter over and over is one of them.
 const MOST: usize = 256;
 /// For a node to do what it is told.
-const PATIENCE: Duration = Duration::from_secs(10);
+pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 /// Where a message begins behind CDR's header.
 const BEGIN: usize = 4;
 /// States (`lifecycle_msgs/msg/State`) in which a node can be told to configure, and to activate itself.
 const UNCONFIGURED: u8 = 1;
 const INACTIVE: u8 = 2;
 
-/// What was told last.
+/// What was told last. A node may be told anew while it is told something new: one of the two comes first to each service, and what is
+/// told anew is what holds by then.
 #[derive(Debug, Default)]
-pub struct Remembered(Mutex<All>);
+pub struct Remembered {
+    all: Mutex<All>,
+    turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
+}
+
+/// While it lives, nobody else tells the node something by the same service.
+pub type Turn = Option<OwnedMutexGuard<()>>;
 
 #[derive(Debug, Default)]
 struct All {
-    /// By what is set: service and parameter.
-    sets: Vec<((String, Vec<u8>), Bytes)>,
-    /// The service and what led from the beginning to where the node is.
-    way: Vec<(String, Transition, Bytes)>,
+    /// In the order in which they were told.
+    sets: Vec<Set>,
+    /// How many were told.
+    told: u64,
+    /// What led from the beginning to where the node is.
+    way: Vec<Step>,
+}
+
+/// Something that was set by this service.
+#[derive(Debug, Clone)]
+struct Set {
+    /// Counted from 1, over all that was told.
+    number: u64,
+    service: String,
+    /// What is set: a parameter, or all that the request says.
+    target: Vec<u8>,
+    request: Bytes,
+}
+
+/// A transition that the node was told by this service.
+#[derive(Debug, Clone, PartialEq)]
+struct Step {
+    service: String,
+    transition: Transition,
+    request: Bytes,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,21 +74,42 @@ enum Transition {
 }
 
 impl Remembered {
+    /// Whoever holds this tells the node by this service; one that does not answer is waited for no longer than that takes at most.
+    pub async fn turn(&self, service: &str) -> Turn {
+        let turn = {
+            let mut turns = self.turns.lock();
+            Arc::clone(turns.entry(service.to_owned()).or_default())
+        };
+        timeout(PATIENCE, turn.lock_owned()).await.ok()
+    }
+
     /// The node was told this.
     pub fn note(&self, service: &str, what: &ServiceUse, request: &Bytes) {
-        let all = &mut *self.0.lock();
+        let all = &mut *self.all.lock();
+        let service = service.to_owned();
         match what {
             ServiceUse::Set => {
-                let key = (service.to_owned(), target(request));
-                all.sets.retain(|(known, _)| *known != key);
+                let target = target(request);
+                all.sets
+                    .retain(|known| known.service != service || known.target != target);
                 if all.sets.len() == MOST {
                     all.sets.remove(0);
                 }
-                all.sets.push((key, request.clone()));
+                all.told += 1;
+                all.sets.push(Set {
+                    number: all.told,
+                    service,
+                    target,
+                    request: request.clone(),
+                });
             }
             ServiceUse::Transition => {
                 let transition = Transition::of(request);
-                let step = (service.to_owned(), transition, request.clone());
+                let step = Step {
+                    service,
+                    transition,
+                    request: request.clone(),
+                };
                 match transition {
                     Transition::Configure => all.way = vec![step],
                     Transition::Activate => {
@@ -73,12 +126,15 @@ impl Remembered {
         }
     }
 
+    /// The first thing that was set after the one of this number, as it holds now.
+    fn next_set(&self, after: u64) -> Option<Set> {
+        let all = self.all.lock();
+        let mut sets = all.sets.iter();
+        sets.find(|set| set.number > after).cloned()
+    }
+
     /// Tells a node that has begun anew, which is called by `ask`. What it refuses, it would have refused before.
     pub async fn tell(&self, ask: impl Fn(&str, Bytes) -> Answer) {
-        let (sets, way) = {
-            let all = self.0.lock();
-            (all.sets.clone(), all.way.clone())
-        };
         let told =
             async |service: &str, request: Bytes| match timeout(PATIENCE, ask(service, request))
                 .await
@@ -93,19 +149,31 @@ impl Remembered {
                     None
                 }
             };
-        for ((service, _), request) in sets {
-            told(&service, request).await;
+        // Whatever is set meanwhile comes behind, and so last to the node, too: one request may set what others do.
+        let mut last = 0;
+        while let Some(next) = self.next_set(last) {
+            let _turn = self.turn(&next.service).await;
+            last = next.number;
+            let holds = |set: &Set| set.number == next.number;
+            if self.all.lock().sets.iter().any(holds) {
+                told(&next.service, next.request).await;
+            }
         }
-        for (service, transition, request) in way {
+        let way = self.all.lock().way.clone();
+        for step in way {
+            let _turn = self.turn(&step.service).await;
+            if !self.all.lock().way.contains(&step) {
+                continue;
+            }
             // A transition that does not lead on from where they are makes nodes of rclpy end.
-            let states = service.replace("change_state", "get_state");
+            let states = step.service.replace("change_state", "get_state");
             let state = told(&states, EMPTY.into()).await;
-            let from = match transition {
+            let from = match step.transition {
                 Transition::Configure => UNCONFIGURED,
                 _ => INACTIVE,
             };
             if state.is_some_and(|state| state.get(BEGIN) == Some(&from)) {
-                told(&service, request).await;
+                told(&step.service, step.request).await;
             }
         }
     }
@@ -133,6 +201,9 @@ impl Transition {
 
 /// What a request sets: the parameter, where it is one, else all that it says.
 fn target(request: &Bytes) -> Vec<u8> {
+    if let Some(names) = reconfigured::names(request) {
+        return names;
+    }
     match (number(request, BEGIN), text(request, BEGIN + 4)) {
         (Some(1), Some(name)) => name.to_vec(),
         _ => request.to_vec(),
@@ -224,5 +295,44 @@ mod tests {
             all.note("/n/set_parameters", &ServiceUse::Set, &set(&name, 0));
         }
         assert_eq!(told(&all, UNCONFIGURED).await.len(), MOST);
+    }
+
+    #[tokio::test]
+    async fn what_is_set_while_a_node_is_told_anew_holds_in_the_end() {
+        let all = Arc::new(Remembered::default());
+        let service = "/n/set_parameters";
+        let note = |all: &Remembered, request: &Bytes| all.note(service, &ServiceUse::Set, request);
+        let [speed, both, faster, slow] = [
+            set("speed", 1),
+            change(7, "both"),
+            set("speed", 2),
+            set("slow", 1),
+        ];
+        note(&all, &speed);
+        note(&all, &both);
+        note(&all, &slow);
+        let (heard, asked) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(None)));
+        all.tell(|_, request| {
+            let first = heard.lock().is_empty();
+            heard.lock().push(request);
+            if first {
+                // While the first is on its way somebody sets something, and waits for the turn.
+                let (setting, heard, faster) = (all.clone(), heard.clone(), faster.clone());
+                let set = tokio::spawn(async move {
+                    let _turn = setting.turn(service).await;
+                    heard.lock().push(faster.clone());
+                    setting.note(service, &ServiceUse::Set, &faster);
+                });
+                *asked.lock() = Some(set);
+            }
+            Box::pin(async {
+                tokio::task::yield_now().await;
+                Ok(Bytes::new())
+            })
+        })
+        .await;
+        // The old value came first, and none of it after the new one; what may set it, too, came between.
+        let heard = heard.lock().clone();
+        assert_eq!(heard, [speed, faster.clone(), both, slow, faster]);
     }
 }

@@ -1,4 +1,4 @@
-//! What a service of the node is to the promise: its own, or one of those that make up an action or manage the node (ROS 2).
+//! What a service of the node is to the promise: its own, or one of those that make up an action (ROS 2) or manage the node.
 
 use std::sync::Arc;
 
@@ -31,7 +31,10 @@ impl ServiceUse {
     /// That of a service of a node of this ROS. Names may be remapped; types say what is meant.
     pub fn of(served: &Served, version: RosVersion) -> Self {
         if version == RosVersion::One {
-            return Self::Request;
+            return match served.type_name.as_str() {
+                "dynamic_reconfigure/Reconfigure" => Self::Set,
+                _ => Self::Request,
+            };
         }
         if let Some((action, part)) = served.name.rsplit_once(ACTION) {
             let action: Arc<str> = action.into();
@@ -86,9 +89,12 @@ mod tests {
         assert_eq!(two("/n/set_parameters", set), ServiceUse::Set);
         let change = two("/n/change_state", "lifecycle_msgs/srv/ChangeState");
         assert_eq!(change, ServiceUse::Transition);
-        // A name alone says nothing, and ROS 1 has none of them.
+        // A name alone says nothing, and of ROS 1 one type alone is about the node.
         assert_eq!(two("/n/set_parameters", "a/srv/Set"), ServiceUse::Request);
         let one = of("/fib/_action/send_goal", "a/Send", RosVersion::One);
         assert_eq!(one, ServiceUse::Request);
+        let reconfigure = "dynamic_reconfigure/Reconfigure";
+        let one = of("/n/set_parameters", reconfigure, RosVersion::One);
+        assert_eq!(one, ServiceUse::Set);
     }
 }

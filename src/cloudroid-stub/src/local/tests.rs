@@ -8,7 +8,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Event, HandOver, LocalState, Outcome, RequestId, SafeStop, Sla};
-use ros::bus::{Bus, Message, ParamValue, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Bus, Message, ParamValue, RosVersion, ServiceHandler, ServiceType, WireType};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
@@ -22,8 +22,11 @@ stories! {
         it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it,
         a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left,
         what_is_latched_while_the_link_is_away_reaches_both_sides,
+        what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests,
         a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over,
         it_calls_what_the_robot_serves,
+        it_is_told_of_parameters_that_change_while_it_runs,
+        a_node_that_waits_for_what_does_not_come_is_taken_for_ready_in_the_end,
         a_crash_is_told_and_it_comes_back,
         what_cannot_run_is_said,
         the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again,
@@ -32,6 +35,7 @@ stories! {
         it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it,
         a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left,
         what_is_latched_while_the_link_is_away_reaches_both_sides,
+        what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests,
         a_crash_is_told_and_it_comes_back,
         what_cannot_run_is_said,
         the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again,
@@ -90,13 +94,15 @@ pub fn setting(world: &World, argv: &[&str]) -> Setting {
         }),
         node: "/ns/relay".into(),
         domain: world.domain(),
+        patience: SOON,
     }
 }
 
 async fn an_original(robot: &Robot, setting: Setting) -> (Original, mpsc::UnboundedReceiver<News>) {
     let string = string_type(robot.bus.version());
+    let input = |topic: &str| (topic.to_owned(), string.clone());
     let interface = Interface {
-        inputs: BTreeMap::from([("/ns/in".to_owned(), string)]),
+        inputs: BTreeMap::from(["/ns/in", "/pose"].map(input)),
         awaited: BTreeSet::from(["/ns/in".to_owned()]),
         outputs: vec!["/absolute/out".into()],
         ..Interface::default()
@@ -271,6 +277,60 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides(ros: RosVersi
     assert_eq!(cloud.inputs.lock().len(), 3, "nothing goes twice");
 }
 
+async fn what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let sla =
+        serde_json::json!({"t_desire": 0.02, "t_max": 60, "local": "cold", "unreached": 0.05});
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let waits = ["awaits=/pose", "awaits-latched=/map"];
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
+        Some(a_relay(&robot, &waits).await),
+        Arc::new(Silent::default()),
+        Arc::new(Listener(told)),
+    );
+    keeper.input(&"/map".into(), latched(ros, "/map_server", "map"));
+    // Where nobody was ever reached the original stands in at once.
+    keeper.link_down();
+    let topic: Arc<str> = "/ns/in".into();
+    keeper.input(&topic, string(ros, "world"));
+    // Its pose is said again and again, as transforms are.
+    let mut due = tokio::time::interval(Duration::from_millis(20));
+    let mut heard = Vec::new();
+    let waiting = async {
+        while heard.last().map(String::as_str) != Some("hello world") {
+            tokio::select! {
+                said = hears.recv() => heard.push(said.unwrap()),
+                _ = due.tick() => keeper.input(&"/pose".into(), string(ros, "pose")),
+            }
+        }
+    };
+    let answered = timeout(SOON, waiting).await;
+    assert!(answered.is_ok(), "{heard:?}: {}", keeper.report().summary);
+    assert_eq!(heard, ["start", "feed", "hello world"]);
+}
+
+async fn a_node_that_waits_for_what_does_not_come_is_taken_for_ready_in_the_end(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let mut setting = setting(&robot.world, &["awaits=/pose"]);
+    setting.patience = Duration::from_millis(200);
+    let (original, mut news) = an_original(&robot, setting).await;
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    original.feed("/pose", &string(ros, "pose"));
+    let mut due = tokio::time::interval(Duration::from_millis(20));
+    let answered = async {
+        loop {
+            tokio::select! {
+                said = output(&mut news) => return said,
+                _ = due.tick() => original.feed("/ns/in", &string(ros, "world")),
+            }
+        }
+    };
+    assert_eq!(timeout(SOON, answered).await.unwrap(), "hello world");
+}
+
 #[tokio::test]
 async fn a_stateful_hand_over_says_what_is_lost() {
     let robot = robot(RosVersion::One).await;
@@ -316,6 +376,52 @@ async fn a_stateful_hand_over_says_what_is_lost() {
     until("cloud lacks 5 of /ns/in").await;
     let lost = keeper.report().lost.unwrap().1;
     assert!(lost.contains("a new servant goes on without"), "{lost}");
+}
+
+#[tokio::test]
+async fn a_hand_over_names_calls_and_goals_that_the_other_side_was_given() {
+    let robot = robot(RosVersion::One).await;
+    let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
+    let (told, mut hears) = mpsc::unbounded_channel();
+    let cloud = Arc::new(Silent::default());
+    let keeper = Keeper::start(
+        Sla::parse(sla).unwrap(),
+        vec!["/mux/goal -> /mux/result by goal".parse().unwrap()],
+        Some(a_relay(&robot, &[]).await),
+        cloud.clone(),
+        Arc::new(Listener(told)),
+    );
+    keeper.link_up(false);
+    let service: Arc<str> = "/mux/select".into();
+    let call = {
+        let (keeper, service) = (keeper.clone(), service.clone());
+        tokio::spawn(async move { keeper.call(&service, Bytes::new()).await })
+    };
+    while cloud.calls.lock().is_empty() {
+        tokio::task::yield_now().await;
+    }
+    let id = cloud.calls.lock()[0];
+    keeper.cloud_answered(id, Ok(Bytes::new()), None);
+    timeout(SOON, call).await.unwrap().unwrap().unwrap();
+    // A goal without an id is no request, and is given to the cloud all the same; what is no command switches nothing.
+    let goal = WireType::named("mux_msgs/SwitchActionGoal");
+    let goal = Message {
+        wire_type: Arc::new(goal),
+        ..string(RosVersion::One, "")
+    };
+    keeper.input(&"/mux/goal".into(), goal);
+    keeper.input(&"/ns/in".into(), string(RosVersion::One, "scan"));
+    keeper.link_down();
+    let mut heard = String::new();
+    while !heard.starts_with("local lacks") {
+        heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
+    }
+    assert_eq!(heard, "local lacks 1 of /mux/goal, 1 of /mux/select");
+    assert_eq!(
+        keeper.report().lost,
+        None,
+        "its state is not said to be lost"
+    );
 }
 
 #[tokio::test]
@@ -403,6 +509,20 @@ async fn it_calls_what_the_robot_serves(ros: RosVersion) {
         original.feed("/ns/in", &string(ros, asked));
         let answer = output(&mut news).await;
         assert!(answer.contains(wanted), "{answer}");
+    }
+}
+
+async fn it_is_told_of_parameters_that_change_while_it_runs(ros: RosVersion) {
+    let robot = robot(ros).await;
+    let (original, mut news) = a_relay(&robot, &[]).await;
+    original.start();
+    state(&mut news, LocalState::Ready).await;
+    let late = ParamValue::String("late".into());
+    for (value, wanted) in [(Some(late), "late"), (None, "/speed")] {
+        original.change_parameter("/speed", value).await;
+        original.feed("/ns/in", &string(ros, "get /speed"));
+        let said = output(&mut news).await;
+        assert!(said.contains(wanted), "{said}");
     }
 }
 
@@ -497,6 +617,10 @@ impl Application for Listener {
         let missed = missed.collect::<Vec<_>>().join(", ");
         let to = format!("{:?}", over.to).to_lowercase();
         let _ = self.0.send(format!("{to} lacks {missed}"));
+    }
+
+    fn lacks(&self, over: &HandOver) {
+        self.handed_over(over);
     }
 
     fn told(&self, _: &Outcome) {}

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
+use link::RobotSession;
 use link::control::FromRobot;
 use link::drops::{Drop, Reporter};
 
@@ -25,17 +26,19 @@ impl Mirror {
     }
 }
 
-/// Until the mirror is gone.
-pub async fn report(mirror: Weak<Mirror>) {
-    let mut reporter = Reporter::default();
-    let mut told = (Weak::new(), Vec::new());
-    loop {
-        tokio::time::sleep(PERIOD).await;
-        let Some(mirror) = mirror.upgrade() else {
-            return;
-        };
+/// What was told so far, and to whom.
+#[derive(Default)]
+pub(super) struct Told {
+    reporter: Reporter,
+    session: Weak<RobotSession>,
+    all: Vec<Drop>,
+}
+
+impl Told {
+    /// Tells what has changed. The cloud is told the sums, and while the link is away nothing: each look would put a record down for it.
+    pub(super) fn report(&mut self, mirror: &Mirror) {
         let all = mirror.dropped();
-        for drop in reporter.news(&all) {
+        for drop in self.reporter.news(&all) {
             if drop.cause.is_meant() {
                 tracing::info!("{drop}");
             } else {
@@ -44,10 +47,23 @@ pub async fn report(mirror: Weak<Mirror>) {
         }
         let session = mirror.session();
         // Another session's cloud was told nothing yet.
-        let other = !std::ptr::eq(Weak::as_ptr(&told.0), Arc::as_ptr(&session));
-        if !all.is_empty() && (other || told.1 != all) {
+        let other = !std::ptr::eq(self.session.as_ptr(), Arc::as_ptr(&session));
+        if session.is_up() && !all.is_empty() && (other || self.all != all) {
             session.report(&FromRobot::Dropped(all.clone()));
-            told = (Arc::downgrade(&session), all);
+            self.session = Arc::downgrade(&session);
+            self.all = all;
         }
+    }
+}
+
+/// Until the mirror is gone.
+pub async fn report(mirror: Weak<Mirror>) {
+    let mut told = Told::default();
+    loop {
+        tokio::time::sleep(PERIOD).await;
+        let Some(mirror) = mirror.upgrade() else {
+            return;
+        };
+        told.report(&mirror);
     }
 }

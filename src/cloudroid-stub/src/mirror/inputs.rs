@@ -3,6 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Duration;
 
 use link::Quality;
 use link::clock::now;
@@ -18,6 +19,9 @@ use super::Mirror;
 
 /// Messages that the bus keeps while the link is busy.
 const QUEUE: usize = 256;
+
+/// Before a subscription that was refused is tried again.
+const REFUSED: Duration = Duration::from_secs(1);
 
 /// Inputs by topic.
 #[derive(Default)]
@@ -220,12 +224,17 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         // Whatever is latched goes to the cloud, too.
         None => Qos::keep_last(QUEUE).latching(true),
     };
-    let mut subscription = match bus.subscribe(&wanted.topic, of, qos).await {
-        Ok(subscription) => subscription,
-        Err(error) => {
-            tracing::warn!(topic = wanted.topic, %error, "cannot be subscribed to");
-            return;
+    let mut told = false;
+    let mut subscription = loop {
+        match bus.subscribe(&wanted.topic, of.clone(), qos).await {
+            Ok(subscription) => break subscription,
+            Err(error) if !told => {
+                told = true;
+                tracing::warn!(topic = wanted.topic, %error, "cannot be subscribed to; trying again");
+            }
+            Err(_) => {}
         }
+        tokio::time::sleep(REFUSED).await;
     };
     let Some(refused) = mirror.upgrade().map(|mirror| {
         let dropped = Arc::clone(&subscription.dropped);

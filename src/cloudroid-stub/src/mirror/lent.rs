@@ -110,6 +110,8 @@ impl LentServices {
             return session.answer(id, arrived, Err(gone));
         };
         let this = mirror.this.clone();
+        // A service may take long, and its session may be replaced meanwhile.
+        let session = Arc::downgrade(&session);
         tokio::spawn(async move {
             let _held = held;
             let Some(mirror) = this.upgrade() else { return };
@@ -126,7 +128,9 @@ impl LentServices {
                 other => other.to_string(),
             });
             // By the session that it came by: the ids of another mean other calls.
-            session.answer(id, arrived, called);
+            if let Some(session) = session.upgrade() {
+                session.answer(id, arrived, called);
+            }
         });
     }
 

@@ -39,6 +39,9 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                     let Some(mirror) = mirror.upgrade() else {
                         return;
                     };
+                    if let Some(original) = mirror.keeper().and_then(|keeper| keeper.original()) {
+                        original.change_parameter(&key, value.clone()).await;
+                    }
                     if mirror.parameters.is_news(&key, value.as_ref())
                         && parameters::can_be_carried(key.trim_end_matches('/'), &mut value)
                     {

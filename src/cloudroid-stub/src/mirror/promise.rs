@@ -239,10 +239,12 @@ impl Promise {
 async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
     // The session that was up last: what it carried is answered yet when it is up again.
     let mut before: Weak<RobotSession> = Weak::new();
+    let Some(mut sessions) = mirror.upgrade().map(|mirror| mirror.sessions()) else {
+        return;
+    };
+    drop(mirror);
     loop {
-        let Some(session) = mirror.upgrade().map(|mirror| mirror.session()) else {
-            return;
-        };
+        let session = sessions.borrow_and_update().clone();
         let mut up = session.up();
         let this = Arc::downgrade(&session);
         drop(session);
@@ -252,8 +254,11 @@ async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
         } else {
             keeper.link_down();
         }
-        // A session that was replaced ends its channel.
-        let _ = up.changed().await;
+        // One that was replaced may live on for what still answers by it.
+        tokio::select! {
+            _ = up.changed() => {}
+            replaced = sessions.changed() => if replaced.is_err() { return },
+        }
     }
 }
 
@@ -340,6 +345,12 @@ impl Application for Way {
         if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
             promise.reports.handed_over(over);
         }
+    }
+
+    fn lacks(&self, over: &HandOver) {
+        tracing::info!(
+            "{over}: a mode or a priority that one of them has switched is not switched there; where it has to be, ask for it again"
+        );
     }
 
     fn decided(&self, event: &Event) {

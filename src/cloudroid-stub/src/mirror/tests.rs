@@ -112,18 +112,21 @@ struct Scene {
     real: Arc<dyn Bus>,
 }
 
+fn session_options() -> SessionOptions {
+    SessionOptions {
+        ping: Duration::from_secs(1),
+        silent: Duration::from_secs(10),
+        lost: Duration::from_secs(20),
+        max_age: None,
+    }
+}
+
 impl Scene {
     async fn new(ros: RosVersion, name: &'static str) -> Self {
         let (robot, servant) = (World::new(ros).await, World::new(ros).await);
         let bridge = servant.node("/bridge").await;
         let (registry, options) = (Arc::new(Registry::of(ros)), HubOptions::default());
-        let session = SessionOptions {
-            ping: Duration::from_secs(1),
-            silent: Duration::from_secs(10),
-            lost: Duration::from_secs(20),
-            max_age: None,
-        };
-        let session = Arc::new(RobotSession::new(session));
+        let session = Arc::new(RobotSession::new(session_options()));
         let node = robot.node(name).await;
         Self {
             ros,
@@ -425,4 +428,67 @@ async fn a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other(ro
     // As launch has it before it sends a second signal.
     let ended = timeout(Duration::from_secs(5), ending).await;
     assert!(ended.expect("an end").is_none());
+}
+
+#[tokio::test]
+async fn a_new_session_is_seen_while_something_still_answers_by_the_old_one() {
+    let scene = Scene::new(RosVersion::One, "/node").await;
+    let watcher: Arc<dyn Bus> = scene.robot.node("/node_cloudroid").await;
+    let diagnostics = Diagnostics::new(&watcher, "/node", "robot").await;
+    let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}, "local": "none"});
+    let sla = Sla::parse(sla).unwrap();
+    let setting = setting(&scene.robot, &[]);
+    let mirror = &scene.mirror;
+    let promised = mirror.promise(sla, setting, diagnostics.unwrap(), &watcher);
+    promised.await.unwrap();
+    let keeper = mirror.keeper().unwrap();
+    let sees = async |is_up: bool| {
+        let seen = async {
+            while keeper.report().link != is_up {
+                tokio::task::yield_now().await;
+            }
+        };
+        let seen = timeout(SOON, seen).await;
+        assert!(seen.is_ok(), "up: {is_up}");
+    };
+    let (_link, served) = scene.links().await;
+    sees(true).await;
+    // A service of the robot that the node has called, and that takes its time.
+    let old = mirror.session();
+    served.abort();
+    sees(false).await;
+    mirror.renew(Arc::new(RobotSession::new(session_options())));
+    let _link = scene.links().await;
+    sees(true).await;
+    drop(old);
+}
+
+#[tokio::test]
+async fn what_was_dropped_is_told_once_the_link_is_back_and_not_put_down_for_it_before() {
+    let scene = Scene::new(RosVersion::One, "/node").await;
+    let mirror = &scene.mirror;
+    let next = || mirror.session().position().2;
+    let before = next();
+    // As many looks as there were in an hour of an outage in which something is dropped all the time.
+    let mut told = dropped::Told::default();
+    for _ in 0..1800 {
+        mirror.drops.add("/scan", Cause::Slow, 1);
+        told.report(mirror);
+    }
+    assert_eq!(next(), before, "records wait");
+    let _link = scene.links().await;
+    let mut up = mirror.session().up();
+    up.wait_for(|up| *up).await.unwrap();
+    told.report(mirror);
+    let seen = async {
+        loop {
+            let status = scene.hub.status();
+            let dropped = status.iter().flat_map(|link| &link.dropped);
+            if dropped.map(|drop| drop.count).sum::<u64>() == 1800 {
+                return;
+            }
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(SOON, seen).await.expect("all of it");
 }

@@ -10,7 +10,9 @@ use ros::bus::{Graph, Liveliness, Publisher, Qos, RosVersion, WireType};
 use ros::ring::{Bounds, Ring};
 use ros::schema::{MessageType, SchemaError};
 use ros::sizes::Sizes;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::retry::Retry;
 use super::{Hub, types};
 use link::clock::now;
 use link::control::Input;
@@ -53,7 +55,12 @@ struct Channel {
     topic: String,
     stamps: Stamps,
     sizes: Arc<Sizes>,
+    latching: bool,
     state: State,
+    /// It could not be advertised when that was tried last.
+    is_refused: bool,
+    /// It is closed once what waits has reached the node.
+    is_closing: bool,
 }
 
 enum State {
@@ -73,7 +80,10 @@ impl Inputs {
             topic: input.topic.clone(),
             stamps: stamps(input, of.as_deref()),
             sizes: hub.inputs.of(&input.topic, of.as_deref()),
+            latching: input.latching,
             state: State::Waiting(Ring::new(WAITING)),
+            is_refused: false,
+            is_closing: false,
         };
         self.channels.lock().insert(input.channel, fresh);
     }
@@ -112,16 +122,34 @@ impl Inputs {
         Some((mark, answered))
     }
 
-    /// Advertises, and lets messages through once the node has connected.
-    pub(super) async fn open(&self, hub: &Arc<Hub>, drops: &Drops, input: Input) {
-        let of = wire_type(hub, &input);
-        let qos = offer(&input, hub.bus.version(), &hub.bus.graph().borrow());
-        let publisher: Arc<dyn Publisher> = match hub.bus.advertise(&input.topic, of, qos).await {
-            Ok(publisher) => publisher.into(),
-            Err(error) => {
-                tracing::warn!(topic = input.topic, %error, "an input cannot be published");
-                return;
+    /// Advertises, and lets messages through once the node has connected. While it is refused it is tried again, at `turns` that it
+    /// takes as others do; the first one is `turn`.
+    pub(super) async fn open(
+        &self,
+        hub: &Arc<Hub>,
+        drops: &Drops,
+        input: Input,
+        (turns, turn): (Arc<Semaphore>, OwnedSemaphorePermit),
+    ) {
+        let mut retry = Retry::default();
+        let mut turn = Some(turn);
+        let publisher: Arc<dyn Publisher> = loop {
+            let of = wire_type(hub, &input);
+            let qos = offer(&input, hub.bus.version(), &hub.bus.graph().borrow());
+            match hub.bus.advertise(&input.topic, of, qos).await {
+                Ok(publisher) => break publisher.into(),
+                Err(error) => {
+                    if retry.is_first() {
+                        tracing::warn!(topic = input.topic, %error, "an input cannot be published; trying again");
+                    }
+                    if !self.refused(drops, input.channel) {
+                        return;
+                    }
+                }
             }
+            drop(turn.take());
+            retry.pause().await;
+            turn = Arc::clone(&turns).acquire_owned().await.ok();
         };
         let counted = Arc::downgrade(&publisher);
         drops.ask(&input.topic, Cause::Slow, move || {
@@ -155,7 +183,34 @@ impl Inputs {
                 }
             }
             channel.state = State::Open(publisher);
+            channel.is_refused = false;
         }
+    }
+
+    /// The channel could not be advertised: what waits for it is too old by the next time, unless it is latched. False where there is no
+    /// next time.
+    fn refused(&self, drops: &Drops, channel: u32) -> bool {
+        let mut channels = self.channels.lock();
+        let Some(channel) = channels.get_mut(&channel) else {
+            return false;
+        };
+        channel.is_refused = true;
+        if let State::Waiting(waiting) = &mut channel.state {
+            if !channel.latching {
+                drops.add(&channel.topic, Cause::Early, waiting.len() as u64);
+                waiting.clear();
+            }
+        }
+        !channel.is_closing
+    }
+
+    /// The robot closes this channel. Whether what waits for it will reach the node in a while, and is waited for.
+    pub(super) fn closes(&self, channel: u32) -> bool {
+        let mut channels = self.channels.lock();
+        channels.get_mut(&channel).is_some_and(|channel| {
+            channel.is_closing = true;
+            !channel.is_refused
+        })
     }
 
     pub(super) fn undecodable(&self, drops: &Drops, channel: u32) {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use ros::bus::{Digest, ServiceType, WireType};
 
+use super::inquiries::Inquiries;
 use super::node_link::{NodeLink, Service};
 use super::seen::{self, Declared, Seen};
 use super::{Hub, types};
@@ -24,6 +25,7 @@ struct Sent {
     graph: Option<Graph>,
     /// Nodes that it was warned of.
     warned: BTreeSet<String>,
+    inquiries: Inquiries,
 }
 
 /// Tells the robot of every change, until the link ends.
@@ -38,6 +40,7 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
         tokio::select! {
             changed = graphs.changed() => if changed.is_err() { return },
             changed = changes.changed() => if changed.is_err() { return },
+            () = sent.inquiries.next() => {}
         }
     }
 }
@@ -52,13 +55,14 @@ impl Sent {
             hub.changed();
         }
         self.warn_of_shared(link, graph.shared_of_process(&link.node));
+        self.inquire(hub, &seen).await;
         let mut graph = Graph {
             siblings: hub.siblings(&graph, &link.node),
             nodes: seen::owners(&graph, &link.node),
             ..Graph::default()
         };
         for (topic, declared) in &seen.outputs {
-            let Some(of) = output_type(hub, topic, declared).await else {
+            let Some(of) = self.output_type(hub, topic, declared) else {
                 continue;
             };
             self.tell(link, &of);
@@ -81,13 +85,47 @@ impl Sent {
             });
         }
         for (service, of) in &seen.services {
-            let served = self.service(link, hub, service, of.as_ref()).await;
+            let served = self.service(link, hub, service, of.as_ref());
             graph.services.extend(served);
         }
         self.let_go(link, &graph);
         if self.graph.as_ref() != Some(&graph) {
             link.session.report(&FromCloud::Graph(graph.clone()));
             self.graph = Some(graph);
+        }
+    }
+
+    /// Asks for types that are not told, those that are new at once; they may be told in a moment.
+    async fn inquire(&mut self, hub: &Hub, seen: &Seen) {
+        let services = seen.services.keys().collect();
+        self.inquiries
+            .retain(&services, &seen.outputs.keys().collect());
+        let before = self.inquiries.count();
+        for (service, told) in &seen.services {
+            if told.is_none() {
+                self.inquiries.service(&hub.bus, service);
+            }
+        }
+        for (topic, declared) in &seen.outputs {
+            self.output_type(hub, topic, declared);
+        }
+        if self.inquiries.count() > before {
+            self.inquiries.settle().await;
+        }
+    }
+
+    /// The type of an output, with its definition where that is known.
+    fn output_type(&mut self, hub: &Hub, topic: &str, declared: &Declared) -> Option<WireType> {
+        match declared {
+            Declared::Named(name) => match hub.registry.message(name) {
+                Ok(known) => Some(WireType::of(&known)),
+                // Its node knows.
+                Err(_) => self.inquiries.topic(&hub.bus, topic),
+            },
+            Declared::Told(of, _) => match types::message(&hub.registry, of) {
+                Some(known) => Some(WireType::of(&known)),
+                None => Some(of.clone()),
+            },
         }
     }
 
@@ -161,7 +199,7 @@ impl Sent {
     }
 
     /// A service; `told`: its type, where the server need not be asked.
-    async fn service(
+    fn service(
         &mut self,
         link: &NodeLink,
         hub: &Hub,
@@ -175,7 +213,7 @@ impl Sent {
         }
         let of = match told {
             Some(told) => told.clone(),
-            None => hub.bus.service_type(name).await.ok()?,
+            None => self.inquiries.service(&hub.bus, name)?,
         };
         let channel = match known {
             // The end that answers was found after the one that is asked: more is known of the same.
@@ -219,20 +257,5 @@ impl Sent {
             }
             there
         });
-    }
-}
-
-/// The type of an output, with its definition where that is known.
-async fn output_type(hub: &Hub, topic: &str, declared: &Declared) -> Option<WireType> {
-    match declared {
-        Declared::Named(name) => match hub.registry.message(name) {
-            Ok(known) => Some(WireType::of(&known)),
-            // Its node knows.
-            Err(_) => hub.bus.topic_type(topic).await.ok(),
-        },
-        Declared::Told(of, _) => match types::message(&hub.registry, of) {
-            Some(known) => Some(WireType::of(&known)),
-            None => Some(of.clone()),
-        },
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use budget::Permit;
 use parking_lot::Mutex;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -417,29 +417,30 @@ impl NodeLink {
 async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<Order>) {
     // A node that is slow to connect to one topic keeps nothing else waiting.
     let mut opening: HashMap<u32, AbortOnDropHandle<()>> = HashMap::new();
+    let turns = Arc::new(Semaphore::new(OPENING));
     while let Some(Order { told, hold, _held }) = orders.recv().await {
         match told {
             FromRobot::Open(input) => {
                 opening.retain(|_, task| !task.is_finished());
-                if opening.len() >= OPENING {
-                    link.inputs.open(&hub, &link.drops, input).await;
-                    continue;
-                }
+                let Ok(turn) = Arc::clone(&turns).acquire_owned().await else {
+                    return;
+                };
+                let turns = (Arc::clone(&turns), turn);
                 let (channel, link, hub) = (input.channel, Arc::clone(&link), Arc::clone(&hub));
-                let open = async move { link.inputs.open(&hub, &link.drops, input).await };
+                let open = async move { link.inputs.open(&hub, &link.drops, input, turns).await };
                 opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
             }
             FromRobot::Close { channel } => {
                 // What came before it is given to the node first.
-                if let Some(task) = opening.remove(&channel) {
+                let task = opening.remove(&channel);
+                if let Some(task) = task.filter(|_| link.inputs.closes(channel)) {
                     let _ = task.await;
                 }
                 link.inputs.close(channel);
                 link.session.peer_closed(channel);
             }
             FromRobot::Listeners { channel, count } => {
-                let outputs = &link.outputs;
-                outputs.listeners(&link, &hub, (channel, count), hold).await;
+                link.outputs.listeners(&link, &hub, (channel, count), hold);
             }
             FromRobot::Parameters(changes) => hub.parameters.change(&hub, changes).await,
             FromRobot::Requests(requests) => {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, Matched, PeerId, Qos, WireType, reaches};
+use ros::bus::{Bus, Graph, Matched, PeerId, Qos, Subscription, WireType, reaches};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
@@ -15,6 +15,7 @@ use super::given::Given;
 use super::held::Hold;
 use super::inputs::{Mark, mark};
 use super::node_link::NodeLink;
+use super::retry::Retry;
 use link::Quality;
 use link::clock::now;
 use link::drops::Cause;
@@ -105,7 +106,7 @@ impl Outputs {
     }
 
     /// So many listen on the robot now; `hold` is let go of once the node knows of it.
-    pub(super) async fn listeners(
+    pub(super) fn listeners(
         &self,
         link: &Arc<NodeLink>,
         hub: &Arc<Hub>,
@@ -128,34 +129,19 @@ impl Outputs {
                 _ => return,
             }
         };
-        let before = match hub.bus.hearing() {
-            Some(hearing) => hearing.heard_over(&topic).await.unwrap_or_default(),
-            None => BTreeSet::new(),
-        };
-        // As latching as the node: of a bus with qualities of service it is a wish, and the node's own offer is what is heard.
-        let subscription = match hub
-            .bus
-            .subscribe(
-                &topic,
-                WireType::any(),
-                Qos::keep_last(QUEUE).latching(true),
-            )
-            .await
-        {
-            Ok(subscription) => subscription,
-            Err(error) => {
-                tracing::warn!(topic, %error, "an output cannot be read");
-                return;
-            }
-        };
-        link.drops
-            .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
-        let publishers = subscription.matched.clone();
         let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = tokio::spawn(async move {
+            let before = match bus.hearing() {
+                Some(hearing) => hearing.heard_over(&topic).await.unwrap_or_default(),
+                None => BTreeSet::new(),
+            };
             // All of it, or its guard would stay behind and end the subscription.
-            let subscription = &mut { subscription };
+            let subscription = &mut { subscribe(&*bus, &topic).await };
+            reader
+                .drops
+                .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
+            let publishers = subscription.matched.clone();
             let connected = async {
                 let heard = heard(&*bus, &reader.node, &topic, publishers, before);
                 let _ = tokio::time::timeout(warm_up, heard).await;
@@ -193,6 +179,24 @@ impl Outputs {
         } else {
             reading.abort();
         }
+    }
+}
+
+/// Subscribes to an output; tries again while that is refused.
+async fn subscribe(bus: &dyn Bus, topic: &str) -> Subscription {
+    // As latching as the node: of a bus with qualities of service it is a wish, and the node's own offer is what is heard.
+    let qos = Qos::keep_last(QUEUE).latching(true);
+    let mut retry = Retry::default();
+    loop {
+        match bus.subscribe(topic, WireType::any(), qos).await {
+            Ok(subscription) => return subscription,
+            Err(error) => {
+                if retry.is_first() {
+                    tracing::warn!(topic, %error, "an output cannot be read; trying again");
+                }
+            }
+        }
+        retry.pause().await;
     }
 }
 

@@ -11,6 +11,7 @@ use link::control::{Exit, FromRobot, Input, Node, Resume};
 use link::record::Record;
 
 mod node_time;
+mod refused;
 
 /// A servant whose nodes run from when they are started, and say nothing.
 #[derive(Default)]

@@ -12,7 +12,7 @@ use super::{Answer, Keeper, Payload, State};
 impl Keeper {
     /// Changes the state, and does what follows.
     pub(super) fn change<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
-        let (result, effects, over) = {
+        let (result, effects, over, is_stateful) = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let result = change(&mut state, now);
@@ -27,13 +27,15 @@ impl Keeper {
                 }
             }
             let over = state.hands_over(now, &effects);
-            (result, effects, over)
+            (result, effects, over, state.is_stateful)
         };
         for effect in effects {
             self.carry_out(effect);
         }
-        if let Some(over) = over {
-            self.robot.handed_over(&over);
+        match over {
+            Some(over) if is_stateful => self.robot.handed_over(&over),
+            Some(over) => self.robot.lacks(&over),
+            None => {}
         }
         result
     }
@@ -47,9 +49,11 @@ impl Keeper {
                 payload,
             } => match (side, channel, payload, request) {
                 // Both have it since it came.
-                (_, _, Payload::Input(message), _) if message.latching => {}
-                (Side::Cloud, Channel::Topic(topic), Payload::Input(message), _) => {
-                    self.cloud.publish(&topic, &message);
+                (_, _, Payload::Input(kept), _) if kept.is_latched => {}
+                (Side::Cloud, Channel::Topic(topic), Payload::Input(kept), _) => {
+                    if let Some(message) = kept.message() {
+                        self.cloud.publish(&topic, &message);
+                    }
                 }
                 (Side::Cloud, Channel::Call(service), Payload::Call(bytes), Some(id)) => {
                     self.cloud.call(id, &service, bytes);
@@ -99,7 +103,11 @@ impl Keeper {
             return;
         };
         match (channel, payload, request) {
-            (Channel::Topic(topic), Payload::Input(message), _) => original.feed(topic, &message),
+            (Channel::Topic(topic), Payload::Input(kept), _) => {
+                if let Some(message) = kept.message() {
+                    original.feed(topic, &message);
+                }
+            }
             (Channel::Call(service), Payload::Call(bytes), Some(id)) => {
                 let answer = original.call(service, bytes);
                 let keeper = self.this.clone();
@@ -118,14 +126,14 @@ impl Keeper {
 impl State {
     /// Notes who is given what, and tells what is lost where one side goes on in place of the other.
     fn hands_over(&mut self, now: Instant, effects: &[Effect<Payload>]) -> Option<HandOver> {
-        let ledger = self.ledger.as_mut()?;
+        let ledger = &mut self.ledger;
         let mut to = None;
         for effect in effects {
             match effect {
                 Effect::Give {
-                    payload: Payload::Input(message),
+                    payload: Payload::Input(kept),
                     ..
-                } if message.latching => {}
+                } if kept.is_latched => {}
                 Effect::Give {
                     side,
                     channel: Channel::Topic(name) | Channel::Call(name),
@@ -133,13 +141,16 @@ impl State {
                 } => ledger.given(*side, name),
                 Effect::Event(Event::Start(_) | Event::Crashed(_)) => ledger.original_begins(),
                 Effect::Event(Event::Feed(Why::LinkDown)) => to = Some(Side::Local),
+                Effect::Event(Event::Feed(_)) if !self.is_stateful => to = Some(Side::Local),
                 Effect::Event(Event::StopFeeding(Why::LinkUp)) => to = Some(Side::Cloud),
                 _ => {}
             }
         }
         // All that was given at this moment counts as given before.
         let over = ledger.hands_over(now, to?)?;
-        self.lost = Some((now, over.to_string()));
+        if self.is_stateful {
+            self.lost = Some((now, over.to_string()));
+        }
         Some(over)
     }
 }

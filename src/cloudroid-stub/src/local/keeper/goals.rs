@@ -175,9 +175,7 @@ impl Keeper {
             {
                 return false;
             }
-            if let Some(ledger) = &mut state.ledger {
-                ledger.told(now, action);
-            }
+            state.ledger.told(now, action);
             let payload = Payload::Goal(Arc::new(sent));
             let request = state.governor.goal(now, action, payload);
             state

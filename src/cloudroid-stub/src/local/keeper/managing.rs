@@ -1,12 +1,13 @@
-//! What manages a node of ROS 2 is no request of its application: it is not measured, and answered by who speaks for the node.
+//! What manages a node is no request of its application: it is not measured, and answered by who speaks for the node.
 
 use std::sync::atomic::Ordering;
-use std::time::Instant;
 
 use bytes::Bytes;
-use qos::{Failure, LocalState, Side};
+use qos::{Failure, Side};
+use tokio::time::timeout;
 
 use super::Keeper;
+use crate::local::remembered::PATIENCE;
 use crate::local::service_use::ServiceUse;
 
 impl Keeper {
@@ -39,17 +40,20 @@ impl Keeper {
         what: &ServiceUse,
         request: Bytes,
     ) -> Result<Bytes, String> {
+        // Who is told anew meanwhile is told this, or told before.
+        let turn = self.remembered.turn(service).await;
         let (side, answer) = self.passed(service, request.clone()).await?;
         self.remembered.note(service, what, &request);
         match side {
             Side::Local => self.cloud_missed.store(true, Ordering::Relaxed),
             Side::Cloud => {
-                let report = self.state.lock().governor.report(Instant::now());
-                if report.local_state == LocalState::Ready {
+                if self.state.lock().context.runs() {
                     let told = self.ask(Side::Local, service, request);
                     let service = service.to_owned();
                     tokio::spawn(async move {
-                        if let Err(failure) = told.await {
+                        let _turn = turn;
+                        let told = timeout(PATIENCE, told).await;
+                        if let Ok(Err(failure)) = told {
                             let reason = failure.text();
                             tracing::debug!(service, reason, "the local original was not told");
                         }

@@ -139,6 +139,7 @@ async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
                 program: None,
                 node: "/node".to_owned(),
                 domain: scene.robot.domain(),
+                patience: SOON,
             };
             let sla = Sla::parse(sla).unwrap();
             let promise = scene

@@ -49,6 +49,7 @@ impl Application for Deaf {
     fn safe_stop(&self, _: &SafeStop) {}
     fn decided(&self, _: &Event) {}
     fn handed_over(&self, _: &HandOver) {}
+    fn lacks(&self, _: &HandOver) {}
     fn told(&self, _: &Outcome) {}
 }
 

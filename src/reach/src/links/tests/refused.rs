@@ -1,0 +1,225 @@
+//! What is refused at first, or hangs: it is tried again, and keeps nothing else waiting.
+
+use std::net::SocketAddr;
+
+use bytes::Bytes;
+use link::drops::Cause;
+use link::record::Data;
+use ros::bus::{Qos, ServiceHandler, ServiceType, WireType};
+use tokio::io::{AsyncReadExt, AsyncWriteExt, copy_bidirectional};
+use tokio::net::TcpStream;
+
+use super::*;
+use crate::links::node_link::NodeLink;
+
+/// A servant with a node in it, and a robot's link to that.
+struct Scene {
+    master: SocketAddr,
+    hub: Arc<Hub>,
+    node: Arc<Ros1Bus>,
+    /// By which the Master knows the node.
+    _known: Box<dyn Send + Sync>,
+    _robot: WebSocket<DuplexStream>,
+}
+
+async fn master() -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions::default());
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    address
+}
+
+/// What a Master says to this.
+async fn asks(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
+    let parameters = parameters.iter();
+    let parameters: String = parameters
+        .map(|text| format!("<param><value>{text}</value></param>"))
+        .collect();
+    let call = format!(
+        "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{parameters}</params></methodCall>"
+    );
+    let mut stream = TcpStream::connect(master).await.unwrap();
+    let length = call.len();
+    let head = format!(
+        "POST / HTTP/1.1\r\nHost: here\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n"
+    );
+    let request = [head, call].concat();
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = Vec::new();
+    while !String::from_utf8_lossy(&answer).contains("</methodResponse>") {
+        assert!(stream.read_buf(&mut answer).await.unwrap() > 0, "{method}");
+    }
+    String::from_utf8(answer).unwrap()
+}
+
+impl Scene {
+    async fn new() -> Self {
+        let address = master().await;
+        let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
+        let (bus, node) = (
+            join("/bridge").await.unwrap(),
+            join("/detect").await.unwrap(),
+        );
+        let known = node.serve("/known", of_echo(), Arc::new(Echo));
+        let known = known.await.unwrap();
+        let (nodes, registry) = (Arc::new(Quiet::default()), Arc::new(Registry::default()));
+        let hub = Hub::new("s1", bus, registry, nodes, HubOptions::default());
+        let (robot, _) = says(&hub, &hello("/detect", 1)).await;
+        Self {
+            master: address,
+            hub,
+            node,
+            _known: known,
+            _robot: robot,
+        }
+    }
+
+    fn link(&self) -> Arc<NodeLink> {
+        self.hub.links.lock()["/detect"].clone()
+    }
+
+    fn tells(&self, record: Record<FromRobot>) {
+        let held = Budget::unlimited().permit();
+        link::Handler::record(&*self.link(), record, held, 0);
+    }
+
+    /// Has the Master say that the node serves this there.
+    async fn serves(&self, service: &str, at: SocketAddr) {
+        let found = asks(self.master, "lookupNode", &["/test", "/detect"]).await;
+        let begin = found.find("http://").expect("its address");
+        let node = found[begin..].split('<').next().unwrap();
+        let at = format!("rosrpc://{at}");
+        let registered = ["/detect", service, &at, node];
+        let registered = asks(self.master, "registerService", &registered).await;
+        assert!(registered.contains(">1<"), "{registered}");
+    }
+
+    /// Returns once the robot may call this.
+    async fn is_told(&self, service: &str) {
+        let link = self.link();
+        while !(link.services.lock().values()).any(|known| known.name == service) {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    }
+}
+
+struct Echo;
+
+#[async_trait]
+impl ServiceHandler for Echo {
+    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
+        Ok(request)
+    }
+}
+
+fn of_echo() -> ServiceType {
+    ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef")
+}
+
+#[tokio::test]
+async fn a_service_that_hangs_keeps_no_other_waiting() {
+    let scene = Scene::new().await;
+    let hangs = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    scene.serves("/a", hangs.local_addr().unwrap()).await;
+    let asked = timeout(PATIENCE, hangs.accept()).await;
+    let (mut asked, _) = asked.expect("it is asked").unwrap();
+    let given_up = async { while asked.read_buf(&mut Vec::new()).await.unwrap_or(0) > 0 {} };
+    let serving = scene.node.serve("/b", of_echo(), Arc::new(Echo));
+    let _serving = serving.await.unwrap();
+    tokio::select! {
+        () = given_up => panic!("the one that hangs was waited for"),
+        told = timeout(PATIENCE, scene.is_told("/b")) => told.unwrap(),
+    }
+}
+
+#[tokio::test]
+async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
+    let scene = Scene::new().await;
+    // At another Master, where nobody else is registered for it.
+    let other = master().await;
+    let elsewhere = Ros1Bus::connect(Arc::new(HostSockets), other, "/elsewhere");
+    let elsewhere = elsewhere.await.unwrap();
+    let serving = elsewhere.serve("/a", of_echo(), Arc::new(Echo));
+    let _serving = serving.await.unwrap();
+    let found = asks(other, "lookupService", &["/test", "/a"]).await;
+    let begin = found.find("rosrpc://").expect("its address") + "rosrpc://".len();
+    let real = found[begin..].split(['<', '/']).next().unwrap().to_owned();
+    // Here it is the node's, behind something that refuses at first.
+    let before = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    scene.serves("/a", before.local_addr().unwrap()).await;
+    let answers = async {
+        for _ in 0..2 {
+            drop(before.accept().await.unwrap());
+        }
+        loop {
+            let (mut asked, _) = before.accept().await.unwrap();
+            let mut server = TcpStream::connect(&real).await.unwrap();
+            let _ = copy_bidirectional(&mut asked, &mut server).await;
+        }
+    };
+    tokio::select! {
+        () = answers => {}
+        told = timeout(PATIENCE, scene.is_told("/a")) => told.expect("it is asked again"),
+    }
+}
+
+#[tokio::test]
+async fn an_input_that_cannot_be_published_is_tried_again() {
+    let scene = Scene::new().await;
+    // Somebody has the topic, with another type.
+    let other = WireType::new(
+        "std_msgs/String",
+        "992ce8a1687cec8c8bd883ec73ca41d1",
+        "string data",
+    );
+    let qos = Qos::keep_last(1);
+    let other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
+    let of = WireType::new(
+        "std_msgs/UInt8",
+        "7c8164229e7d2c17eb95e9231617fdee",
+        "uint8 data",
+    );
+    let mut heard = scene
+        .node
+        .subscribe("/image", of.clone(), qos)
+        .await
+        .unwrap();
+    scene.tells(Record::Control(FromRobot::Open(Input {
+        channel: 1,
+        topic: "/image".into(),
+        type_name: of.name.clone(),
+        md5: of.digest.to_string(),
+        definition: of.definition.clone(),
+        ..Input::default()
+    })));
+    let says = |value: u8| {
+        scene.tells(Record::Data(Data {
+            channel: 1,
+            encoded: false,
+            latching: false,
+            born: 0,
+            left: 0,
+            serialise: 0,
+            answered: None,
+            message: Bytes::from(vec![value]),
+        }));
+    };
+    says(1);
+    let refused = async {
+        let dropped = || scene.link().status().drops;
+        while !(dropped().iter()).any(|drop| drop.cause == Cause::Early && drop.count == 1) {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    timeout(PATIENCE, refused)
+        .await
+        .expect("what waits is too old by the next time");
+    drop(other);
+    let connected = heard.matched.wait_for(|now| now.connected() > 0);
+    let connected = timeout(PATIENCE, connected).await;
+    assert!(connected.is_ok(), "it is not tried again");
+    says(2);
+    let message = timeout(PATIENCE, heard.messages.recv()).await.unwrap();
+    assert_eq!(message.unwrap().bytes, [2_u8][..]);
+}
