@@ -488,6 +488,7 @@ fn main() -> ExitCode {
         ],
         stories![push:
             a_cpp_package_is_compiled_and_greets,
+            which_output_answers_which_input_is_found_or_said,
             a_python_package_adds,
             a_launch_file_is_resolved_by_roslaunch,
             a_workspace_is_built_in_order,

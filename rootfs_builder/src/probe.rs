@@ -15,6 +15,7 @@
 mod describe;
 mod feed;
 mod frames;
+mod heard;
 mod incomplete;
 mod lender;
 mod plausible;
@@ -27,6 +28,7 @@ use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
+use package::requests::Watched;
 use parking_lot::Mutex;
 use ros::bus::{Bus, Graph, Qos, RosVersion, Subscription, TopicNodes, WireType};
 use ros::plumbing;
@@ -39,11 +41,10 @@ use tokio::time::Instant;
 pub use settle::still;
 
 use feed::Feed;
+use heard::Heard;
 
 /// Messages of an output that are kept between two looks.
 const KEPT: usize = 8;
-/// Messages of an output that were longer than the one before, from which on it grows.
-const LONGER: u32 = 3;
 /// Each round gives what the one before has made a node ask for.
 const MOST_ROUNDS: usize = 12;
 
@@ -198,6 +199,8 @@ pub struct Found {
     pub warnings: Vec<String>,
     /// Outputs whose messages became longer and longer.
     pub growing: Vec<String>,
+    /// Outputs that carried the stamp of what an input was given.
+    pub watched: BTreeSet<Watched>,
     /// Nodes that their programs have put into a namespace, with the names that they have there.
     pub moved: BTreeMap<String, String>,
 }
@@ -258,8 +261,7 @@ async fn look(
         subscriptions: BTreeMap::new(),
         tried: BTreeSet::new(),
         eager: BTreeSet::new(),
-        latched: BTreeSet::new(),
-        lengths: BTreeMap::new(),
+        heard: Heard::default(),
     };
     if !settle::still(&mut look.watch, options).await? {
         look.warnings.push(format!(
@@ -303,11 +305,12 @@ async fn look(
         incomplete::mark_late(&mut found.interface, &bare.interface);
         *unfed.lock() = Some(found.clone());
     }
+    look.hear();
+    found.watched = look.heard.answers(|stamp| feed.stamped(stamp));
     incomplete::warn(&mut found, options, &mut feed);
     found.warnings.extend(idle);
     found.warnings.splice(..0, look.warnings);
-    let grown = look.lengths.into_iter().filter(|(_, of)| of.is_growth());
-    found.growing = grown.map(|(topic, _)| topic).collect();
+    found.growing = look.heard.growing();
     Ok(found)
 }
 
@@ -370,31 +373,7 @@ struct Look<'a> {
     subscriptions: BTreeMap<String, Subscription>,
     tried: BTreeSet<String>,
     eager: BTreeSet<String>,
-    latched: BTreeSet<String>,
-    /// Of each output's messages.
-    lengths: BTreeMap<String, Lengths>,
-}
-
-/// How the length of a topic's messages changes.
-#[derive(Debug, Clone, Copy, Default)]
-struct Lengths {
-    last: Option<usize>,
-    grown: u32,
-    shrunk: bool,
-}
-
-impl Lengths {
-    fn note(&mut self, length: usize) {
-        if let Some(last) = self.last.replace(length) {
-            self.grown += u32::from(length > last);
-            self.shrunk |= length < last;
-        }
-    }
-
-    /// A counter in a text becomes longer now and then; what gathers becomes so with each input.
-    fn is_growth(&self) -> bool {
-        self.grown >= LONGER && !self.shrunk
-    }
+    heard: Heard,
 }
 
 impl Look<'_> {
@@ -442,18 +421,19 @@ impl Look<'_> {
         }
     }
 
-    async fn describe(&mut self, feed: &Feed<'_>) -> Result<Found, ProbeError> {
+    /// Takes what outputs have said since.
+    fn hear(&mut self) {
         for (topic, subscription) in &mut self.subscriptions {
             while let Some(message) = subscription.messages.try_recv() {
-                if message.latching {
-                    self.latched.insert(topic.clone());
-                }
-                let lengths = self.lengths.entry(topic.clone()).or_default();
-                lengths.note(message.bytes.len());
+                self.heard.note(topic, &message);
             }
         }
+    }
+
+    async fn describe(&mut self, feed: &Feed<'_>) -> Result<Found, ProbeError> {
+        self.hear();
         let seen = describe::Seen {
-            latched: self.latched.clone(),
+            latched: self.heard.latched.clone(),
             eager: self.eager.clone(),
             graph: self.graph(),
             options: self.options,

@@ -35,6 +35,28 @@ pub fn a_cpp_package_is_compiled_and_greets() -> Verdict {
     Ok(())
 }
 
+pub fn which_output_answers_which_input_is_found_or_said() -> Verdict {
+    let daemon = world().shared()?;
+    let deployer = daemon.deployer();
+    let pushes = |request: &str| {
+        let options = ["--name", "asked", "--node", "greeter", "--request", request];
+        deployer.pushes("greeter_cpp", &options)
+    };
+    let there = "/greeter/nme is no input of this service; its inputs are /greeter/name";
+    pushes("/greeter/nme=/greeter/greeting")?.failed_saying(&["--request", there])?;
+    let pushed = pushes("/greeter/name=/greeter/greeting")?.succeeded()?;
+    let words =
+        "an answer on /greeter/greeting is counted against /greeter/name, as --request says";
+    ensure!(pushed.said().contains(words), "{}", pushed.said());
+    let about = daemon.get_json("/api/v1/services/asked")?;
+    let said = &about["interface"]["requests"];
+    ensure!(
+        said[0]["input"] == "/greeter/name" && said[0]["reason"] == "stated",
+        "{said}"
+    );
+    Ok(())
+}
+
 pub fn a_python_package_adds() -> Verdict {
     let daemon = world().with(ADDER)?;
     let mut robot = daemon.robot("adder_py")?;

@@ -71,7 +71,8 @@ pub fn stub(
     let mut variables = vec![(of.workspaces, &*workspace), ("NO_COLOR", "1")];
     variables.extend(environment);
     let toml = format!(
-        "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nthreshold = 4.0\ninitial = 15.0\n{settings}\n",
+        "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nthreshold = 4.0\ninitial = 15.0\n\
+         request = \"/image -> /people_detect/found\"\n{settings}\n",
         cable.server
     );
     site.stub_among(&variables, &toml, of.package, of.executable, of.argv)

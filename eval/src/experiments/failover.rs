@@ -151,8 +151,8 @@ fn stub(workshop: &Workshop, local: &str, native: Option<&Plan>, directory: &Pat
     } = &mut plan.node
     {
         *settings = format!(
-            "service = \"{}\"\nlocal = \"{local}\"\ndesire = {:?}\nmax = {:?}\nthreshold = {:?}\ninitial = {:?}\ncap = {:?}\nfallback_after = 300.0",
-            DETECTOR.name, TIMES.0, TIMES.1, Q.1, Q.0, Q.2
+            "service = \"{}\"\nrequest = \"{} -> {}\"\nlocal = \"{local}\"\ndesire = {:?}\nmax = {:?}\nthreshold = {:?}\ninitial = {:?}\ncap = {:?}\nfallback_after = 300.0",
+            DETECTOR.name, DETECTOR.request, DETECTOR.answer, TIMES.0, TIMES.1, Q.1, Q.0, Q.2
         );
         if let Some(native) = native {
             let workspace = installs(native, directory)?;

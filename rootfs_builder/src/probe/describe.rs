@@ -125,6 +125,7 @@ pub(super) async fn describe(
             .filter(|node| *node != seen.options.own_name)
             .collect(),
         late: Vec::new(),
+        requests: None,
         definitions: texts.used,
     };
     for need in &found.interface.needs {

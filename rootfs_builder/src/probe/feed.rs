@@ -25,6 +25,7 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::frames::{self, Frames};
+use super::heard::{Stamp, stamp};
 use super::lender::AnyService;
 use super::{ProbeOptions, plausible, settle};
 
@@ -58,6 +59,8 @@ pub(super) struct Feed<'a> {
     served: BTreeMap<String, Box<dyn Send + Sync>>,
     beats: BTreeMap<&'static str, Beat>,
     given: BTreeMap<String, Box<dyn Publisher>>,
+    /// Whose message had this stamp, where messages have one.
+    stamps: BTreeMap<Stamp, String>,
     refused: BTreeMap<String, String>,
     goals: BTreeSet<String>,
     any: BTreeSet<String>,
@@ -102,6 +105,7 @@ impl<'a> Feed<'a> {
             served: BTreeMap::new(),
             beats: BTreeMap::new(),
             given: BTreeMap::new(),
+            stamps: BTreeMap::new(),
             refused: BTreeMap::new(),
             goals: BTreeSet::new(),
             any: BTreeSet::new(),
@@ -134,6 +138,11 @@ impl<'a> Feed<'a> {
     /// Inputs that take any type, of which nobody said which.
     pub(super) fn any(&self) -> &BTreeSet<String> {
         &self.any
+    }
+
+    /// The input whose message had this stamp.
+    pub(super) fn stamped(&self, stamp: &Stamp) -> Option<&String> {
+        self.stamps.get(stamp)
     }
 
     /// Inputs that could not be fed, with the reason.
@@ -349,6 +358,9 @@ impl<'a> Feed<'a> {
                         // Not latched unless it is asked for, which would reach whoever is late, too: relays latch what
                         // was latched.
                         let _ = self.answered(reaches(publisher.matched(), 1)).await;
+                        if let Some(stamp) = stamp(&bytes).filter(|_| message.has_header()) {
+                            self.stamps.insert(stamp, name.clone());
+                        }
                         publisher.publish(bytes);
                         self.given.insert(name.clone(), publisher);
                         longest = longest.max(Some(began.elapsed()));

@@ -487,22 +487,3 @@ async fn services_that_are_missed_are_named() {
     assert!(found.warnings.iter().any(told), "{:?}", found.warnings);
     lab.ends().await;
 }
-
-#[test]
-fn what_gathers_becomes_longer_with_each_message() {
-    for (lengths, grows) in [
-        (vec![], false),
-        (vec![10, 10, 10, 10, 10], false),
-        // "9", "10", … "99", "100": a counter in a text.
-        (vec![9, 10, 10, 10, 11, 11], false),
-        (vec![10, 18, 26, 34], true),
-        (vec![10, 10, 18, 26, 26, 34], true),
-        (vec![10, 18, 26, 34, 12], false),
-    ] {
-        let mut seen = Lengths::default();
-        for length in &lengths {
-            seen.note(*length);
-        }
-        assert_eq!(seen.is_growth(), grows, "{lengths:?}");
-    }
-}

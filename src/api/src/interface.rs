@@ -30,6 +30,26 @@ pub struct Interface {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub lifecycle: Vec<String>,
+    /// Inputs that are answered by outputs, as stubs are told.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub requests: Vec<Request>,
+}
+
+/// An input, and the outputs by whose messages it is answered.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct Request {
+    /// The node; empty where it is not known.
+    pub node: String,
+    /// Absolute name of the input.
+    pub input: String,
+    /// Absolute names of the outputs; the time of the first one counts.
+    pub outputs: Vec<String>,
+    /// By what an answer is recognised: `stamp`, or `arrival` where the next message is the answer.
+    pub by: String,
+    /// Why it is these: `stated`, `watched` (at the push), `alone` (the node has no others) or `guessed`.
+    pub reason: String,
 }
 
 /// A ROS service, or an action of ROS 2, that a robot should serve.

@@ -48,6 +48,10 @@ pub struct PushOptions {
     /// Dependencies by hand: rosdep key or ROS package → Debian package.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
+    /// Which input is answered by which output, instead of what the push finds: `INPUT=OUTPUT`, or as a robot's
+    /// stub.toml has it, `INPUT -> OUTPUT, OUTPUT by arrival`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub requests: Vec<String>,
     /// Debian or ROS packages to add, for compiling and for running.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
@@ -78,6 +82,33 @@ pub struct PushOptions {
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,
 }
+
+impl PushOptions {
+    /// Reads [`requests`](Self::requests).
+    ///
+    /// # Errors
+    /// What is wrong with one of them, and how it is written.
+    pub fn read_requests(&self) -> Result<Vec<qos::Pair>, String> {
+        self.requests
+            .iter()
+            .map(|text| read_request(text))
+            .collect()
+    }
+}
+
+/// Reads a request as `--request` has it.
+///
+/// # Errors
+/// What is wrong with it, and how it is written.
+pub fn read_request(text: &str) -> Result<qos::Pair, String> {
+    match text.split_once('=') {
+        Some((input, outputs)) if !text.contains("->") => format!("{input} -> {outputs}").parse(),
+        _ => text.parse(),
+    }
+}
+
+/// The title of the last step: once it has begun nothing cancels the push.
+pub const PUBLISHING: &str = "publishing";
 
 /// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -159,6 +190,37 @@ mod tests {
             serde_json::from_str::<PushOptions>(&text).expect("its own output"),
             options
         );
+    }
+
+    #[test]
+    fn requests_are_written_as_on_robots_or_shorter() {
+        for (text, expected) in [
+            ("/image=/boxes", "/image -> /boxes"),
+            (
+                "/image=/boxes,/view by arrival",
+                "/image -> /boxes, /view by arrival",
+            ),
+            ("/image -> /boxes by stamp", "/image -> /boxes by stamp"),
+        ] {
+            assert_eq!(
+                read_request(text).map(|pair| pair.to_string()).as_deref(),
+                Ok(expected)
+            );
+        }
+        for text in [
+            "/image",
+            "image=/boxes",
+            "/image=",
+            "",
+            "/image=/boxes by luck",
+        ] {
+            let options = PushOptions {
+                requests: vec![text.to_owned()],
+                ..PushOptions::default()
+            };
+            let refused = options.read_requests().expect_err(text);
+            assert!(refused.contains("write it as"), "{refused}");
+        }
     }
 
     #[test]

@@ -9,10 +9,11 @@ use api::stub::{ARCHITECTURES, architecture};
 use flate2::{Compression, GzBuilder};
 use package::inventory::Inventory;
 use package::stub::{
-    About, Content, Contents, Files, MANIFEST, PROGRAM, Portal, SIGNATURE, SIGNER, compose,
-    manifest,
+    About, Answered, Content, Contents, Files, MANIFEST, PROGRAM, Portal, SIGNATURE, SIGNER,
+    compose, manifest,
 };
 use ros::bus::RosVersion;
+use ros::remaps::Remaps;
 use ros::ros2::arguments;
 use sign::SigningKey;
 use store::RevisionRecord;
@@ -128,6 +129,7 @@ pub fn files(
         names: &names(revision, inventory),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
+        requests: &requests(revision, inventory),
         times: times(&revision.plan.sla),
     };
     compose(&about, contents).map_err(no_stub)
@@ -154,6 +156,36 @@ fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, S
         }
     }
     names
+}
+
+/// Which inputs are answered by which outputs, as programs call them: a robot remaps its nodes otherwise than the push
+/// did. Those of a publication that says nothing of them are decided now.
+fn requests(revision: &RevisionRecord, inventory: &Inventory) -> Vec<Answered> {
+    let ros = revision.flavour.ros.bus();
+    let mut answered: Vec<Answered> = Vec::new();
+    for request in revision.interface.decided_requests(ros) {
+        let node = revision
+            .plan
+            .nodes
+            .iter()
+            .find(|node| node.name == request.node);
+        let program = node.and_then(|node| {
+            let mut programs = inventory.programs.iter();
+            programs.find(|(_, path)| node.argv.contains(path))
+        });
+        let remaps = node
+            .map(|node| Remaps::of(ros, node.argv.get(1..).unwrap_or_default(), &node.name))
+            .unwrap_or_default();
+        let one = Answered {
+            program: program.map(|(name, _)| name.clone()),
+            request: request.pair.renamed(|name| remaps.undo(name).to_owned()),
+            node: request.node,
+        };
+        if !answered.contains(&one) {
+            answered.push(one);
+        }
+    }
+    answered
 }
 
 /// T_desire and T_max in seconds; where one of them is given it is both.
@@ -357,6 +389,67 @@ mod tests {
         assert_eq!(names(&revision, &inventory), expected.into());
         revision.flavour.ros = Version::Ros1;
         assert!(names(&revision, &inventory).is_empty());
+    }
+
+    #[test]
+    fn requests_are_told_as_programs_call_their_topics() {
+        use package::interface::{Direction, Topic};
+        let topic = |name: &str, direction| Topic {
+            name: name.into(),
+            type_name: "std_msgs/String".into(),
+            md5: String::new(),
+            direction,
+            nodes: vec!["/left/finder".into()],
+            latched: false,
+            lazy: false,
+            qos: None,
+        };
+        let definition = ("std_msgs/msg/String".to_owned(), "string data\n".to_owned());
+        let revision = RevisionRecord {
+            service: "s".into(),
+            number: 1,
+            image: String::new(),
+            published: 0,
+            package: "p".into(),
+            owner: None,
+            source: String::new(),
+            flavour: Flavour::default(),
+            plan: Plan {
+                nodes: vec![NodeSpec {
+                    name: "/left/finder".into(),
+                    argv: ["/opt/p/lib/p/find", "image:=/camera", "_rate:=2"]
+                        .map(str::to_owned)
+                        .into(),
+                    environment: BTreeMap::new(),
+                    directory: String::new(),
+                    respawn: false,
+                    respawn_delay: 0.0,
+                    required: false,
+                }],
+                ..Plan::default()
+            },
+            // Of an earlier release: nothing is decided in it.
+            interface: Interface {
+                topics: vec![
+                    topic("/camera", Direction::Input),
+                    topic("/left/finder/found", Direction::Output),
+                ],
+                definitions: [definition].into(),
+                ..Interface::default()
+            },
+        };
+        let inventory = Inventory {
+            programs: [("find".to_owned(), "/opt/p/lib/p/find".to_owned())].into(),
+            ..Inventory::default()
+        };
+        let expected = Answered {
+            node: "/left/finder".into(),
+            program: Some("find".into()),
+            request: "/left/image -> /left/finder/found by arrival"
+                .parse()
+                .expect("a pair"),
+        };
+        assert_eq!(requests(&revision, &inventory), [expected]);
     }
 
     #[test]

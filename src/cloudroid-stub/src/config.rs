@@ -22,7 +22,7 @@
 //! age = 0.5            # instead of desire and max, seconds: greatest age that an output reaches
 //! desired_age = 0.2    # the age that is wished for; age where absent
 //! output = "/people"   # which output those are about; the one that answers the node's requests where absent
-//! request = "auto"     # "auto", or "INPUT -> OUTPUT" where that is wrong
+//! request = "auto"     # "auto": as the push decided (revision.toml), or "INPUT -> OUTPUT" where that is wrong
 //! # The same for several, with other times than desire and max for those that need them: inputs, services and actions.
 //! requests = ["/image -> /people", { request = "/plan", desire = 1.0, max = 5.0 }]
 //!

@@ -20,6 +20,7 @@ mod parameters;
 pub mod promise;
 mod refusals;
 mod reports;
+pub mod requests;
 mod safe_stop;
 mod stand_in;
 #[cfg(test)]

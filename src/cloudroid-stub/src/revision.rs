@@ -22,6 +22,20 @@ pub struct Revision {
     pub names: BTreeMap<String, String>,
     /// What holds where the robot says nothing.
     pub defaults: Defaults,
+    /// Which inputs are answered by which outputs, as the push has decided.
+    pub requests: Vec<Answered>,
+}
+
+/// An input of a node and the outputs that answer it.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub struct Answered {
+    /// Absolute name of the node at the push; empty where it was not known.
+    pub node: String,
+    /// Its executable, where it is known.
+    pub program: Option<String>,
+    /// `INPUT -> OUTPUT, OUTPUT by stamp`, by absolute names at the push, as they were without remaps.
+    pub request: String,
 }
 
 /// What the service's deployer says of response times, in seconds; both or neither.

@@ -31,6 +31,7 @@ use crate::linked;
 use crate::local::{Program, Setting};
 use crate::machine;
 use crate::mirror::diagnostics::Diagnostics;
+use crate::mirror::requests::Request;
 use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::output;
@@ -156,7 +157,8 @@ async fn begin(
     let bus = join(robot, &robot.node).await?;
     buses.push(Arc::clone(&bus));
     let config = with_parameters(config, &*bus, robot).await?;
-    let config = config.or(&Revision::read(&asked.node.share).defaults);
+    let made_of = Revision::read(&asked.node.share);
+    let config = config.or(&made_of.defaults);
     if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
         tracing::warn!(
             "fallback_after counts only until the server is reached for the first time where desire and max, a rate or an age are given: then those decide when the local original answers"
@@ -174,7 +176,10 @@ async fn begin(
         buses.push(Arc::clone(&watcher));
         let diagnostics = Diagnostics::new(&watcher, &robot.node, &config.robot()).await?;
         let original = local_original(asked, robot);
-        mirror.promise(sla, original, diagnostics, &watcher).await?;
+        let decided = Request::decided(&made_of.requests, &asked.node.node, robot);
+        mirror
+            .promise(sla, original, decided, diagnostics, &watcher)
+            .await?;
     }
     let mut parameters = mirror.parameters().await;
     if robot.sim_time {

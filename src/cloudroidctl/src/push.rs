@@ -5,6 +5,7 @@ mod progress;
 mod shared;
 
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
 use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
@@ -63,6 +64,11 @@ pub struct Push {
     /// TOML or JSON file with what to add to the interface, where the push cannot find all of it.
     #[arg(long, value_name = "FILE")]
     interface: Option<PathBuf>,
+    /// Which input is answered by which output, instead of what the push finds; may be given several times. The
+    /// output's messages are counted against the input's times by robots that promise any. Several outputs:
+    /// /image=/boxes,/view; also as in a robot's stub.toml: '/image -> /boxes by arrival'.
+    #[arg(long = "request", value_name = "INPUT=OUTPUT", value_parser = request)]
+    requests: Vec<String>,
     /// Debian package that provides a dependency; may be given several times.
     #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
     map: Vec<(String, String)>,
@@ -116,6 +122,10 @@ fn assignment(text: &str) -> Result<(String, String), String> {
         Some((from, to)) if !from.is_empty() => Ok((from.to_owned(), to.to_owned())),
         _ => Err("write A:=B".to_owned()),
     }
+}
+
+fn request(text: &str) -> Result<String, String> {
+    api::push::read_request(text).map(|pair| pair.to_string())
 }
 
 fn volume(text: &str) -> Result<Volume, String> {
@@ -217,9 +227,10 @@ impl Push {
                 uri.len()
             );
         }
+        let publishing = AtomicBool::new(false);
         tokio::select! {
-            outcome = send(client, format, &uri, self.path) => outcome,
-            _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was published"),
+            outcome = send(client, format, &uri, self.path, &publishing) => outcome,
+            _ = tokio::signal::ctrl_c() => bail!(cancelled(publishing.into_inner())),
         }
     }
 
@@ -246,6 +257,7 @@ impl Push {
             args: self.args.iter().cloned().collect(),
             remaps: self.remaps.iter().cloned().collect(),
             interface,
+            requests: self.requests.clone(),
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
             limits: self.limits.into(),
@@ -269,11 +281,21 @@ impl Push {
     }
 }
 
+/// What is said of a push that was interrupted here. `publishing`: the daemon had begun to.
+fn cancelled(publishing: bool) -> &'static str {
+    if publishing {
+        "interrupted while it was being published, which goes on; see cloudroidctl services"
+    } else {
+        "cancelled; nothing was published"
+    }
+}
+
 async fn send(
     client: &Client,
     format: Format,
     uri: &str,
     path: Option<PathBuf>,
+    publishing: &AtomicBool,
 ) -> anyhow::Result<ServiceDetail> {
     let (body, packing) = match path {
         Some(path) => {
@@ -295,6 +317,10 @@ async fn send(
         };
         progress.show(&event)?;
         match event {
+            // The daemon's last step.
+            PushEvent::Step { title } if title == api::push::PUBLISHING => {
+                publishing.store(true, Ordering::Relaxed)
+            }
             PushEvent::Done { service, .. } => return Ok(*service),
             PushEvent::Error { problem } => {
                 return Err(packing_failed(packing).unwrap_or_else(|| problem.into()));
@@ -332,7 +358,7 @@ mod tests {
             "--apt opencv_apps --name people --base b --node people_detect --node other/node --param debug_view=false \
              --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map eigen=libeigen3-dev \
              --with opencv-data --cpus 1.5 --memory 512M --max-cpus 2 --max-memory 1G \
-             --rrt 100ms --max-rrt 0.3",
+             --rrt 100ms --max-rrt 0.3 --request /image=/people_detect/found",
         )
         .expect("valid");
         let options = push.options().expect("no file is read");
@@ -340,6 +366,7 @@ mod tests {
             "apt": "opencv_apps", "name": "people", "base": "b", "nodes": ["people_detect", "other/node"],
             "params": {"debug_view": false, "/rate": 1.5, "word": "hi", "list": [1, 2]},
             "remaps": {"image": "/camera/image"}, "map": {"eigen": "libeigen3-dev"}, "with": ["opencv-data"],
+            "requests": ["/image -> /people_detect/found"],
             "limits": {"cpus": 1.5, "memory": 536_870_912},
             "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "sla": {"rrt": "100ms", "max_rrt": "300ms"}, "source": "--apt opencv_apps"
         });
@@ -483,6 +510,8 @@ mod tests {
             "./pkg --arg a=b",
             "./pkg --remap a",
             "./pkg --map key=",
+            "./pkg --request /image",
+            "./pkg --request image=/boxes",
             "./pkg --cpus none",
             "./pkg --cpus 0",
             "./pkg --max-cpus 0",

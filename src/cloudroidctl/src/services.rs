@@ -100,6 +100,15 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.actions {
         actions.row([entry.name.clone(), entry.type_name.clone()]);
     }
+    let mut requests = Table::new(&["REQUEST", "ANSWERED ON", "BY", ""]);
+    for entry in &service.interface.requests {
+        requests.row([
+            entry.input.clone(),
+            entry.outputs.join(", "),
+            entry.by.clone(),
+            entry.reason.clone(),
+        ]);
+    }
     let mut needs = Table::new(&["NEEDS", "CALLED BY"]);
     for entry in &service.interface.needs {
         needs.row([entry.name.clone(), entry.nodes.join(", ")]);
@@ -139,6 +148,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for table in [
         &nodes,
         &topics,
+        &requests,
         &services,
         &needs,
         &actions,

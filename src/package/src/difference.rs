@@ -250,6 +250,7 @@ mod tests {
             parameters: vec![parameter("/p", 1)],
             needs: Vec::new(),
             lifecycle: Vec::new(),
+            requests: None,
             definitions: [(
                 "a/action/Go".to_owned(),
                 "int32 x # goal\n---\n---\n".to_owned(),

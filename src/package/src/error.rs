@@ -160,6 +160,40 @@ pub enum Error {
         /// What was found.
         found: String,
     },
+    /// A request is said to be of a topic that there is not.
+    #[error("{topic} is no {direction} of this service; {}", listed(.direction, .topics))]
+    NoSuchTopic {
+        /// The topic.
+        topic: String,
+        /// `input` or `output`.
+        direction: &'static str,
+        /// Those that there are.
+        topics: Vec<String>,
+    },
+    /// A request is said to be answered by stamp, and a message has none.
+    #[error("{topic} is a {type_name}, which has no header.stamp; write \"by arrival\"")]
+    NoStamp {
+        /// The topic.
+        topic: String,
+        /// Its type.
+        type_name: String,
+    },
+    /// A request is said to be the goal of an action.
+    #[error(
+        "{input} is said to be answered by goal; goals of actions are recognised without being named, so leave it out"
+    )]
+    GoalIsNoTopic {
+        /// The topic.
+        input: String,
+    },
+    /// Two requests are said to have the same topic.
+    #[error(
+        "{topic} is named twice; name all outputs that answer an input in one request, and each output in one"
+    )]
+    NamedTwice {
+        /// The topic.
+        topic: String,
+    },
     /// A stub cannot be put together.
     #[error(
         "the image holds no package.xml of {package}, so robots could not install a stub of it; push it with its share directory"
@@ -168,6 +202,13 @@ pub enum Error {
         /// The ROS package.
         package: String,
     },
+}
+
+fn listed(direction: &str, topics: &[String]) -> String {
+    match topics {
+        [] => format!("it has no {direction}s"),
+        topics => format!("its {direction}s are {}", topics.join(", ")),
+    }
 }
 
 impl From<foreign::Error> for Error {

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use crate::requests::Request;
+
 mod descriptor;
 mod qos;
 
@@ -32,6 +34,10 @@ pub struct Interface {
     /// Nodes that have a lifecycle (ROS 2), by name; the services of it are not repeated in `services`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub lifecycle: Vec<String>,
+    /// Which inputs are answered by which outputs, as the push has decided; none in what was recorded before pushes did
+    /// ([`Interface::decided_requests`]).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub requests: Option<Vec<Request>>,
     /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`:
     /// those used above and all they refer to.
     pub definitions: BTreeMap<String, String>,

@@ -42,9 +42,12 @@ const KEYS: [(&str, &[&str]); 7] = [
 ];
 
 impl Interface {
-    /// The text of an `interface.toml`. TOML has no null: members and elements that are null are left out.
+    /// The text of an `interface.toml`, without the requests. TOML has no null: members and elements that are null are
+    /// left out.
     pub fn to_toml(&self) -> String {
         let mut writable = self.clone();
+        // Decided, and not to be stated here.
+        writable.requests = None;
         for parameter in &mut writable.parameters {
             parameter.value = parameter.value.take().and_then(without_nulls);
         }

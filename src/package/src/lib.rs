@@ -6,6 +6,7 @@
 //!   sources ──foreseen──▶ programs and launch files, as far as they show
 //!   layers ──inventory::take──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
+//!   interface, answers that were seen ──requests──▶ which input is answered by which outputs
 //!   layers, inventory, interface ──stub──▶ the files that a robot installs in the package's place
 //! ```
 //!
@@ -33,6 +34,7 @@ mod merged;
 pub mod names;
 mod order;
 mod read;
+pub mod requests;
 pub mod stub;
 mod supplement;
 pub mod workspace;

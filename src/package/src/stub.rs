@@ -68,8 +68,22 @@ pub struct About<'a> {
     pub interface: &'a Interface,
     /// Answers depend on earlier requests, as the deployer says.
     pub stateful: bool,
+    /// Which inputs of nodes are answered by which outputs.
+    pub requests: &'a [Answered],
     /// T_desire and T_max in seconds, as the deployer says, where a robot says nothing of its own.
     pub times: Option<(f64, f64)>,
+}
+
+/// An input of a node and the outputs that answer it, as the node's program calls them.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Answered {
+    /// Absolute name of the node at the push: what is below it or beside it is so on a robot, too.
+    pub node: String,
+    /// Its executable, where it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub program: Option<String>,
+    /// Absolute names of the topics, as they were without remaps.
+    pub request: qos::Pair,
 }
 
 /// What the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a robot's

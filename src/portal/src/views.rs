@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use api::{Capacity, Interface, Isolation, Node, Revision, ServiceDetail, ServiceSummary, Status};
 use package::interface as recorded;
+use ros::bus::RosVersion;
 
 use crate::app::App;
 use crate::errors::Error;
@@ -58,13 +59,13 @@ pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
                 argv: node.argv.clone(),
             })
             .collect(),
-        interface: interface(&current.interface),
+        interface: interface(current.flavour.ros.bus(), &current.interface),
         shared: current.plan.shared,
         groups: app.choreographer.groups(name),
     })
 }
 
-fn interface(of: &recorded::Interface) -> Interface {
+fn interface(ros: RosVersion, of: &recorded::Interface) -> Interface {
     Interface {
         topics: of.topics.iter().map(topic).collect(),
         services: of
@@ -104,6 +105,24 @@ fn interface(of: &recorded::Interface) -> Interface {
                 nodes: need.nodes.clone(),
             })
             .collect(),
+        requests: of.decided_requests(ros).iter().map(request).collect(),
+    }
+}
+
+fn request(of: &package::requests::Request) -> api::interface::Request {
+    use package::requests::Reason;
+    api::interface::Request {
+        node: of.node.clone(),
+        input: of.pair.input.clone(),
+        outputs: of.pair.outputs.clone(),
+        by: of.pair.by.map(|by| by.to_string()).unwrap_or_default(),
+        reason: match of.reason {
+            Reason::Stated => "stated",
+            Reason::Watched => "watched",
+            Reason::Alone => "alone",
+            Reason::Guessed => "guessed",
+        }
+        .to_owned(),
     }
 }
 

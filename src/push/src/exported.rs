@@ -13,6 +13,7 @@ use image::Received;
 use package::interface::Interface;
 use package::inventory::{Inventory, Published};
 use package::names::{is_graph_name, is_package};
+use package::requests::Reason;
 use rootfs_builder::{
     BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, wrong_with_components,
 };
@@ -163,6 +164,11 @@ impl ServiceRecord {
             grants: plan.grants.clone(),
             stateful: plan.stateful,
             stateless: !plan.stateful,
+            requests: {
+                let requests = self.interface.requests.iter().flatten();
+                let stated = requests.filter(|request| request.reason == Reason::Stated);
+                stated.map(|request| request.pair.to_string()).collect()
+            },
             shared: plan.shared,
             rollout: asked.rollout,
             interface: Some(interface),
@@ -237,21 +243,19 @@ impl Pusher {
         Ok(Made::Imported(Box::new(imported)))
     }
 
-    /// Writes the rows of an exported service, where there are none: those that were measured here are better.
-    pub(super) async fn take_over_rows(
-        &self,
-        name: &str,
-        record: &ServiceRecord,
-        report: &Reporter,
-    ) -> Result<(), Error> {
+    /// Writes the rows of an exported service, where there are none: those that were measured here are better. The
+    /// service is published without them, too.
+    pub(super) fn take_over_rows(&self, name: &str, record: &ServiceRecord, report: &Reporter) {
         let rows = record.rows();
         if rows.rows.is_empty() {
-            return Ok(());
+            return;
         }
         let outcome = match rows.rows.iter().try_for_each(choreographer::check_row) {
             _ if rows.rows.len() > choreographer::MOST_ROWS => Err("there are too many".to_owned()),
             Err(reason) => Err(reason),
-            Ok(()) => Ok(self.catalogue.take_over_rows(name, &rows)?),
+            Ok(()) => {
+                (self.catalogue.take_over_rows(name, &rows)).map_err(|error| error.to_string())
+            }
         };
         let count = rows.rows.len();
         let words = match outcome {
@@ -263,8 +267,7 @@ impl Pusher {
             ),
             Err(reason) => format!("the exported dictionary is left out: {reason}"),
         };
-        report.warning(words).await;
-        Ok(())
+        report.last_warning(words);
     }
 }
 

@@ -37,6 +37,8 @@ use std::time::{Duration, Instant};
 use api::PushOptions;
 use catalogue::{Catalogue, names};
 use choreographer::Choreographer;
+use package::inventory::Inventory;
+use package::requests;
 use reach::Opener;
 use reach::group::shareable;
 use rootfs_builder::{BuildOutcome, Builder, PushRequest, Source};
@@ -50,7 +52,7 @@ use exported::Imported;
 use places::Places;
 use request::Reporter;
 use room::Disks;
-use store::{Journal, NewEvent, Plan, RevisionRecord};
+use store::{Journal, Plan, RevisionRecord};
 
 pub use error::Error;
 pub use exported::{RECORD, ServiceRecord};
@@ -196,11 +198,17 @@ impl Pusher {
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;
         }
+        let layers: Vec<_> = built.layers.iter().map(layer).collect();
         let shown = self.shown(id, options, (built, plan), (name.clone(), by), report);
-        let layers = left.during(shown).await?;
+        let (record, inventory) = left.during(shown).await?;
+        // The token may have been revoked meanwhile.
+        by.may(&name)?;
+        // From here on nothing breaks it off: what was published is not told to have been cancelled.
+        report.publishing.cancel();
+        let terms = options.rollout;
+        self.publish(record, inventory, terms, report).await?;
         if let Some((record, _)) = &imported {
-            let rows = self.take_over_rows(&name, record, report);
-            left.during(rows).await?;
+            self.take_over_rows(&name, record, report);
         }
         Ok(Published {
             layers,
@@ -252,7 +260,7 @@ impl Pusher {
             .map(|built| Made::Built(Box::new(built)))
     }
 
-    /// Finds the interface of an image, and publishes both; gives the image's layers.
+    /// Finds the interface of an image: what is to be published of it.
     async fn shown(
         &self,
         id: &str,
@@ -260,7 +268,7 @@ impl Pusher {
         (built, mut plan): (BuildOutcome, Plan),
         (name, by): (String, &Deployer),
         report: &Reporter,
-    ) -> Result<Vec<api::push::Layer>, Error> {
+    ) -> Result<(RevisionRecord, Inventory), Error> {
         self.check_owner(&name, std::slice::from_ref(&built.package))?;
         report.step("starting it once to find its interface").await;
         for warning in self.choreographer.check_grants(&plan.grants)? {
@@ -277,6 +285,15 @@ impl Pusher {
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         interface_limits::check_interface(&interface)?;
+        let ros = built.flavour.ros.bus();
+        let decided = requests::decide(ros, &interface, &found.watched);
+        let stated = options.read_requests().map_err(Error::Options)?;
+        let decided = requests::state(ros, &interface, &stated, decided)
+            .map_err(|error| Error::Options(format!("--request: {error}")))?;
+        for request in &decided {
+            report.request(request).await;
+        }
+        interface.requests = Some(decided);
         if !(options.stateful || options.stateless) {
             let signs = stateful::signs(&interface, &found.growing);
             if let Some(question) = stateful::question(&signs) {
@@ -284,15 +301,13 @@ impl Pusher {
             }
         }
         if plan.shared.is_some() {
-            shared::check_interface(built.flavour.ros.bus(), &interface)?;
+            shared::check_interface(ros, &interface)?;
             for remark in shareable::remarks(&interface) {
                 report.warning(remark).await;
             }
         }
-        // The token may have been revoked meanwhile.
-        by.may(&name)?;
         let record = RevisionRecord {
-            service: name.clone(),
+            service: name,
             number: 0,
             image: built.image.to_string(),
             published: store::now(),
@@ -303,26 +318,8 @@ impl Pusher {
             plan,
             interface,
         };
-        report.step("publishing").await;
-        let number = self
-            .publish(record, built.inventory, options.rollout)
-            .await?;
-        let about = NewEvent {
-            service: Some(&name),
-            ..NewEvent::default()
-        };
-        self.journal.info(
-            "published",
-            &format!("{name} is published, revision {number}"),
-            &about,
-        );
-        let layer = |layer: &rootfs_builder::BuiltLayer| api::push::Layer {
-            name: layer.name.to_owned(),
-            digest: layer.info.digest.to_string(),
-            size: layer.info.size,
-            cached: layer.cached,
-        };
-        Ok(built.layers.iter().map(layer).collect())
+        report.step(api::push::PUBLISHING).await;
+        Ok((record, built.inventory))
     }
 
     /// A service belongs to the package that it was first made of.
@@ -376,6 +373,15 @@ impl Pusher {
 enum Made {
     Built(Box<BuildOutcome>),
     Imported(Box<Imported>),
+}
+
+fn layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
+    api::push::Layer {
+        name: of.name.to_owned(),
+        digest: of.info.digest.to_string(),
+        size: of.info.size,
+        cached: of.cached,
+    }
 }
 
 fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {

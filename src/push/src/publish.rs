@@ -8,16 +8,19 @@ use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
 
 use super::Pusher;
+use super::request::Reporter;
 use crate::Error;
 
 impl Pusher {
-    /// Publishes the revision on these terms, and has a warm container made of it.
+    /// Publishes the revision on these terms, and has a warm container made of it. What fails once it is published is a
+    /// warning: then it is there.
     pub(super) async fn publish(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
         terms: Option<RolloutTerms>,
-    ) -> Result<u64, Error> {
+        report: &Reporter,
+    ) -> Result<(), Error> {
         let service = record.service.clone();
         let before = match self.catalogue.package(&service)? {
             Some(_) => Some(self.catalogue.current(&service)?.number),
@@ -34,19 +37,24 @@ impl Pusher {
         };
         self.choreographer.refill_warm_pool();
         let number = published?;
-        match terms {
-            Some(terms) => {
-                let choreographer = &self.choreographer;
-                choreographer
-                    .begin_rollout(&service, before, number, terms)
-                    .await?;
-            }
-            None => {
-                let choreographer = &self.choreographer;
-                choreographer.revision_changed(&service, number).await?;
-            }
+        let about = NewEvent {
+            service: Some(&service),
+            ..NewEvent::default()
+        };
+        let words = format!("{service} is published, revision {number}");
+        self.journal.info("published", &words, &about);
+        let choreographer = &self.choreographer;
+        let followed = match terms {
+            Some(terms) => choreographer
+                .begin_rollout(&service, before, number, terms)
+                .await
+                .map(|_| ()),
+            None => choreographer.revision_changed(&service, number).await,
+        };
+        if let Err(error) = followed {
+            report.last_warning(format!("{words}, but its servants do not follow: {error}"));
         }
-        Ok(number)
+        Ok(())
     }
 
     /// Makes an earlier revision the current one.

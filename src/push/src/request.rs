@@ -8,6 +8,7 @@ use std::time::Duration;
 use api::{Limits, PushEvent, PushOptions, Sla};
 use catalogue::names;
 use futures_util::future::BoxFuture;
+use package::requests::{Reason, Request};
 use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
@@ -22,6 +23,8 @@ pub(super) struct Reporter {
     events: mpsc::Sender<PushEvent>,
     /// The build of this push, as long as it works.
     pub(super) building: TaskTracker,
+    /// Cancelled when the push begins to publish, after which nothing breaks it off.
+    pub(super) publishing: CancellationToken,
 }
 
 impl Reporter {
@@ -29,6 +32,7 @@ impl Reporter {
         Self {
             events,
             building: TaskTracker::new(),
+            publishing: CancellationToken::new(),
         }
     }
 
@@ -41,6 +45,22 @@ impl Reporter {
 
     pub(super) async fn warning(&self, message: String) {
         self.event(PushEvent::Warning { message }).await;
+    }
+
+    /// Tells it if the client reads: what is published does not wait for one that does not.
+    pub(super) fn last_warning(&self, message: String) {
+        let _ = self.events.try_send(PushEvent::Warning { message });
+    }
+
+    /// Tells what an answer is counted against.
+    pub(super) async fn request(&self, request: &Request) {
+        let words = request.to_string();
+        match request.reason {
+            Reason::Guessed => self.warning(words).await,
+            Reason::Stated | Reason::Watched | Reason::Alone => {
+                self.event(PushEvent::Log { line: words }).await;
+            }
+        }
     }
 
     pub(super) async fn event(&self, event: PushEvent) {
@@ -136,6 +156,9 @@ impl Pusher {
         }
         check_caps(options).map_err(Error::Options)?;
         check_sla(options).map_err(Error::Options)?;
+        options
+            .read_requests()
+            .map_err(|error| Error::Options(format!("--request {error}")))?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;
         }
@@ -154,11 +177,14 @@ impl Pusher {
         cancel: CancellationToken,
     ) -> Result<Published, Error> {
         let id = format!("push-{}", names::random(8));
-        let outcome = tokio::select! {
-            outcome = blocking::cancellable(self.push(&id, options, by, archive, report)) => outcome,
-            () = cancel.cancelled() => Err(Error::Ending),
-            reason = (by.over)() => Err(Error::NotAllowed(reason)),
+        let work = blocking::cancellable(self.push(&id, options, by, archive, report));
+        let over = async {
+            tokio::select! {
+                () = cancel.cancelled() => Error::Ending,
+                reason = (by.over)() => Error::NotAllowed(reason),
+            }
         };
+        let outcome = unless_over(work, over, &report.publishing).await;
         // First what the builder has in there: it goes when its containers have ended.
         report.building.close();
         report.building.wait().await;
@@ -191,6 +217,22 @@ impl Pusher {
             }
         }
     }
+}
+
+/// Does the work, unless it is `over` before it publishes.
+async fn unless_over<T>(
+    work: impl Future<Output = Result<T, Error>>,
+    over: impl Future<Output = Error>,
+    publishing: &CancellationToken,
+) -> Result<T, Error> {
+    tokio::pin!(work);
+    tokio::select! {
+        outcome = &mut work => return outcome,
+        error = over => if !publishing.is_cancelled() {
+            return Err(error);
+        }
+    }
+    work.await
 }
 
 /// Refuses caps that no limits keep.
@@ -241,6 +283,30 @@ mod tests {
     use api::{Caps, Size, Span};
 
     use super::*;
+
+    #[tokio::test]
+    async fn a_push_that_publishes_is_not_cancelled() {
+        for (publishes, expected) in [(false, "nothing"), (true, "published")] {
+            let (publishing, over) = (CancellationToken::new(), CancellationToken::new());
+            let (done, awaited) = tokio::sync::oneshot::channel::<()>();
+            let work = async {
+                if publishes {
+                    publishing.cancel();
+                }
+                over.cancel();
+                // The client is gone, and the database works yet.
+                let _ = awaited.await;
+                Ok("published")
+            };
+            let ended = async {
+                over.cancelled().await;
+                let _ = done.send(());
+                Error::Ending
+            };
+            let outcome = unless_over(work, ended, &publishing).await;
+            assert_eq!(outcome.unwrap_or("nothing"), expected);
+        }
+    }
 
     #[test]
     fn caps_below_the_pushs_own_limits_are_refused() {

@@ -11,6 +11,12 @@ const MAPS: [&str; 5] = [
     "nav_msgs/GetMapResult",
 ];
 
+/// Words in names of services that change how a node works.
+const SWITCHING: [&str; 12] = [
+    "set", "enable", "disable", "switch", "select", "toggle", "reset", "clear", "start", "stop",
+    "pause", "resume",
+];
+
 /// What points to state, a phrase each; `growing` are outputs whose messages became longer and longer.
 pub(super) fn signs(interface: &Interface, growing: &[String]) -> Vec<String> {
     let of = |direction: Direction| {
@@ -37,7 +43,43 @@ pub(super) fn signs(interface: &Interface, growing: &[String]) -> Vec<String> {
             None
         }
     };
-    of(Direction::Output).filter_map(sign).collect()
+    let mut signs: Vec<String> = of(Direction::Output).filter_map(sign).collect();
+    signs.extend(switches(interface));
+    signs
+}
+
+/// What may switch how messages are answered: it is given to whoever answers then, and the other side does not know it.
+fn switches(interface: &Interface) -> Vec<String> {
+    let requests = interface.requests.iter().flatten();
+    let Some(answer) = requests
+        .filter_map(|request| request.pair.outputs.first())
+        .next()
+    else {
+        return Vec::new();
+    };
+    let may =
+        |what: &str, name: &str| format!("its {what} {name} may switch what it says on {answer}");
+    let actions = interface
+        .actions
+        .iter()
+        .map(|action| may("action", &action.name));
+    let services = interface.services.iter();
+    let services = services.filter(|service| is_switch(&service.name, &service.type_name));
+    actions
+        .chain(services.map(|service| may("service", &service.name)))
+        .collect()
+}
+
+/// Whether a service is likely to change how its node works, by type and name.
+fn is_switch(name: &str, type_name: &str) -> bool {
+    // What that sets is given to both sides.
+    if type_name == "dynamic_reconfigure/Reconfigure" {
+        return false;
+    }
+    let last = name.rsplit('/').next().unwrap_or(name).to_lowercase();
+    let words: Vec<&str> = last.split('_').collect();
+    type_name.replacen("/srv/", "/", 1) == "std_srvs/SetBool"
+        || words.iter().any(|word| SWITCHING.contains(word))
 }
 
 /// The question to the deployer; none where nothing points to state.
@@ -59,6 +101,10 @@ fn is_transforms(topic: &Topic) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
+    use ros::bus::RosVersion;
+
     use super::*;
 
     fn topic(name: &str, type_name: &str, direction: Direction, latched: bool) -> Topic {
@@ -130,6 +176,53 @@ mod tests {
                 assert!(found.contains(words), "{what}: {found}");
             }
         }
+    }
+
+    #[test]
+    fn what_may_be_switched_points_to_state() {
+        use package::interface::{Action, Service};
+        let service = |name: &str, type_name: &str| Service {
+            name: name.into(),
+            type_name: type_name.into(),
+            md5: String::new(),
+            node: "/mux".into(),
+        };
+        let mut mux = Interface {
+            topics: vec![
+                topic("/nav_vel", "geometry_msgs/Twist", Direction::Input, false),
+                topic("/cmd_vel", "geometry_msgs/Twist", Direction::Output, false),
+            ],
+            services: vec![
+                service("/mux/select_input", "p/Select"),
+                service("/mux/lock", "std_srvs/srv/SetBool"),
+                service("/mux/settings", "p/Settings"),
+            ],
+            actions: vec![Action {
+                name: "/priority".into(),
+                type_name: "p/Priority".into(),
+                node: "/mux".into(),
+            }],
+            ..Interface::default()
+        };
+        assert!(
+            signs(&mux, &[]).is_empty(),
+            "nothing is answered, so nothing is switched"
+        );
+        mux.requests = Some(package::requests::decide(
+            RosVersion::One,
+            &mux,
+            &BTreeSet::new(),
+        ));
+        let switched = |what: &str| format!("its {what} may switch what it says on /cmd_vel");
+        assert_eq!(
+            signs(&mux, &[]),
+            [
+                "action /priority",
+                "service /mux/select_input",
+                "service /mux/lock"
+            ]
+            .map(switched)
+        );
     }
 
     #[test]

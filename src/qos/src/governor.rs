@@ -64,7 +64,7 @@ pub struct Governor<P> {
 }
 
 impl<P: Clone> Governor<P> {
-    /// The link is down and the local original not started. `pairs` are those that [`find`](crate::find) gave.
+    /// The link is down and the local original not started. `pairs` are those whose topics exist already.
     pub fn new(sla: Sla, pairs: Vec<Pair>, limits: Limits) -> Self {
         let metered = |(output, meter): (&str, Meter)| Metered {
             output: output.to_owned(),
@@ -125,7 +125,7 @@ impl<P: Clone> Governor<P> {
         self.decide(now);
     }
 
-    /// More of the interface has become known: pairs of new inputs, further outputs of known ones.
+    /// The topics of more decided pairs exist now, or further outputs of those that are known: nothing else is paired.
     pub fn learn(&mut self, now: Instant, pairs: Vec<Pair>) {
         if let Some(meter) = &mut self.meter {
             if let Some(first) = pairs.first().filter(|_| meter.output.is_empty()) {

@@ -7,9 +7,9 @@
 //!   the time             ──▶ └──────────┘ ──▶ failures, safe stop, a report
 //! ```
 //! The parts, each usable alone: [`Sla`] is what the robot was promised; [`Satisfaction`] is the algorithm that judges
-//! the cloud; [`find`] tells which input triggers which output; [`Arbiter`] knows for each request who was asked and who
-//! answered; [`Decider`] runs the local original; [`PhaseBook`] says where the time of a request goes. A [`Governor`]
-//! is all of them for one node.
+//! the cloud; a [`Pair`] tells which input triggers which output; [`Arbiter`] knows for each request who was asked and
+//! who answered; [`Decider`] runs the local original; [`PhaseBook`] says where the time of a request goes. A
+//! [`Governor`] is all of them for one node.
 //!
 //! The local original of a stateless service, as `local = "cold"` and `local = "warm"` have it:
 //! ```text
@@ -28,7 +28,6 @@
 mod arbiter;
 mod channel;
 mod decider;
-mod finder;
 mod governor;
 mod hand_over;
 mod measure;
@@ -46,7 +45,6 @@ mod span;
 pub use arbiter::{Arbiter, Limits, Verdict};
 pub use channel::Channel;
 pub use decider::{Decider, Event, LocalState, Why};
-pub use finder::{Found, Topic, find};
 pub use governor::{Effect, Governor};
 pub use hand_over::{HandOver, Ledger, Missed};
 pub use measure::Meter;

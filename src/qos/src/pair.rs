@@ -42,13 +42,32 @@ impl Correlation {
     }
 }
 
+impl Pair {
+    /// The same with other names of topics.
+    pub fn renamed(&self, name: impl Fn(&str) -> String) -> Self {
+        Self {
+            input: name(&self.input),
+            outputs: self.outputs.iter().map(|output| name(output)).collect(),
+            by: self.by,
+        }
+    }
+}
+
+impl fmt::Display for Correlation {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::Stamp => "stamp",
+            Self::Goal => "goal",
+            Self::Arrival => "arrival",
+        })
+    }
+}
+
 impl fmt::Display for Pair {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{} -> {}", self.input, self.outputs.join(", "))?;
         match self.by {
-            Some(Correlation::Stamp) => out.write_str(" by stamp"),
-            Some(Correlation::Goal) => out.write_str(" by goal"),
-            Some(Correlation::Arrival) => out.write_str(" by arrival"),
+            Some(by) => write!(out, " by {by}"),
             None => Ok(()),
         }
     }

@@ -15,6 +15,7 @@ mod join;
 pub mod net;
 mod network;
 pub mod plumbing;
+pub mod remaps;
 pub mod ring;
 pub mod ros1;
 pub mod ros2;

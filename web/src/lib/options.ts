@@ -55,6 +55,7 @@ export const GROUPS: { title: string; fields: Field[] }[] = [
     { key: 'map', label: 'Dependencies by hand, KEY=DEBIAN-PACKAGE, one a line', flag: '--map', lines: 2 },
     { key: 'with', label: 'Debian or ROS packages to add, one a line', flag: '--with', lines: 2 },
     { key: 'interface', label: 'What to add to the interface, as TOML or JSON', flag: '--interface', lines: 3 },
+    { key: 'requests', label: 'Which input is answered by which output, INPUT=OUTPUT, one a line; as found by default', flag: '--request', example: '/image=/boxes', lines: 2 },
     { key: 'devices', label: 'Devices by their CDI names, one a line; where the operator allows them', flag: '--device', example: 'nvidia.com/gpu=0', lines: 2 },
     { key: 'volumes', label: 'Directories of the server to read, SOURCE:TARGET, one a line; where allowed', flag: '--volume', lines: 2 },
     { key: 'egress', label: 'Hosts to reach, HOST:PORT, one a line; where allowed', flag: '--egress', lines: 2 },
@@ -137,6 +138,7 @@ export function options(values: Values, chosen: Chosen): Options {
     map: map('map', '=', 'Dependencies by hand'),
     with: list(values.with),
     interface: text('interface'),
+    requests: list(values.requests),
     limits: filled({
       cpus: figure('cpus', '--cpus'), cpu_weight: figure('cpu_weight', '--cpu-weight'), cpuset: text('cpuset'),
       memory: text('memory'), memory_high: text('memory_high'), pids: figure('pids', '--pids'),

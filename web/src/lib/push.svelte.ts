@@ -11,6 +11,7 @@ export interface Options {
   args?: Record<string, string>;
   remaps?: Record<string, string>;
   interface?: string;
+  requests?: string[];
   map?: Record<string, string>;
   with?: string[];
   base?: string;

@@ -85,6 +85,7 @@ export interface ServiceDetail extends ServiceSummary {
     parameters: { name: string; value?: unknown; descriptor?: Descriptor }[];
     lifecycle: string[];
     needs: { name: string; nodes: string[] }[];
+    requests: { node: string; input: string; outputs: string[]; by: string; reason: string }[];
   };
 }
 

@@ -308,3 +308,31 @@ async fn an_interface_without_anything_in_it_is_told() {
     assert!(found.warnings.iter().any(told), "{:?}", found.warnings);
     lab.ends().await;
 }
+
+#[tokio::test]
+async fn outputs_that_carry_the_stamp_of_an_input_answer_it() {
+    let lab = lab().await;
+    let node = Node::of(&lab);
+    let stamped = "geometry_msgs/TransformStamped";
+    let _switch = node.hears("/a_switch", "std_msgs/Empty").await;
+    let _unanswered = node.hears("/another", stamped).await;
+    let mut images = node.hears("/image", stamped).await;
+    let boxes = node.tells("/boxes", node.wire(stamped)).await;
+    let beat = node.tells("/beat", node.wire(stamped)).await;
+    let answering = tokio::spawn(async move {
+        while let Some(image) = images.messages.recv().await {
+            boxes.publish(image.bytes);
+            // Stamped, too, with a time of its own.
+            beat.publish(bytes::Bytes::from_static(&[7; 200]));
+        }
+    });
+    let found = lab.probed(&["/package"], std::future::pending()).await;
+    let watched = found.expect("found").watched;
+    let expected = Watched {
+        input: "/image".to_owned(),
+        output: "/boxes".to_owned(),
+    };
+    assert_eq!(watched, BTreeSet::from([expected]));
+    answering.abort();
+    lab.ends().await;
+}

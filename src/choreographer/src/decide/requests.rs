@@ -1,52 +1,34 @@
 //! On which topics robots ask a servant and are answered.
 
-use package::interface::{Direction, Interface, Topic};
+use package::interface::{Direction, Interface};
+use package::requests::Reason;
 use qos::{Correlation, Pair};
 use ros::bus::RosVersion;
-use ros::schema::Registry;
 
 /// The input whose messages are requests and the outputs that answer them, where the interface has one such pair and leaves
 /// no doubt which. By stamps there is none. Where the next output would be the answer, there has to be one input and one
-/// output, and nothing else to ask: what a node publishes at its own pace would be taken for an answer.
+/// output, and nothing else to ask, unless the deployer says so: what a node publishes at its own pace would be taken
+/// for an answer.
 pub fn asked_by_topic(ros: RosVersion, interface: &Interface) -> Option<Pair> {
-    let registry = Registry::of(ros);
-    for (key, text) in &interface.definitions {
-        // Of a type that is not usable no message is recognised.
-        let _ = registry.insert(key, text);
-    }
-    let end = |topic: &Topic| {
-        let of_type = registry.message(&topic.type_name).ok()?;
-        Some(qos::Topic {
-            name: topic.name.clone(),
-            type_name: topic.type_name.clone(),
-            stamped: of_type.has_header(),
-        })
+    let mut requests = interface.decided_requests(ros);
+    let request = requests.pop().filter(|_| requests.is_empty())?;
+    let mut pair = request.pair;
+    // A latched output tells a state.
+    let is_latched = |name: &String| {
+        let mut topics = interface.topics.iter();
+        topics.any(|it| it.direction == Direction::Output && it.latched && it.name == *name)
     };
-    let ends = |direction: Direction| -> Vec<qos::Topic> {
-        let topics = interface.topics.iter();
-        // A latched output tells a state.
-        let topics = topics.filter(|it| it.direction == direction && !it.latched);
-        topics.filter_map(end).collect()
-    };
-    let (inputs, outputs) = (ends(Direction::Input), ends(Direction::Output));
-    let mut pairs = qos::find(&inputs, &outputs, None).ok()?.pairs;
-    let pair = pairs.pop().filter(|_| pairs.is_empty())?;
-    let others = |ends: &[qos::Topic], of: &Pair| -> Vec<qos::Topic> {
-        let is_of = |name: &String| *name == of.input || of.outputs.contains(name);
-        let others = ends.iter().filter(|end| !is_of(&end.name));
-        others.cloned().collect()
-    };
-    let finds = |inputs: &[qos::Topic], outputs: &[qos::Topic]| {
-        qos::find(inputs, outputs, None).is_ok_and(|found| !found.pairs.is_empty())
-    };
-    let alone = || {
-        interface.services.is_empty()
+    pair.outputs.retain(|name| !is_latched(name));
+    let is_alone = || {
+        request.reason == Reason::Alone
+            && interface.services.is_empty()
             && interface.actions.is_empty()
-            && !finds(&others(&inputs, &pair), &outputs)
-            && !finds(&inputs, &others(&outputs, &pair))
     };
-    let certain = pair.by == Some(Correlation::Stamp) || alone();
-    certain.then_some(pair)
+    let is_certain = match pair.by? {
+        Correlation::Stamp => true,
+        _ => request.reason == Reason::Stated || is_alone(),
+    };
+    (is_certain && !pair.outputs.is_empty()).then_some(pair)
 }
 
 #[cfg(test)]

@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use link::control::Graph;
-use qos::{Pair, Topic};
+use qos::Pair;
 use ros::bus::{Qos, WireType};
 
+use super::requests::{self, Request};
 use crate::local;
 
 /// What is known of the interface so far: lazy inputs become known later, and do not go again.
@@ -67,20 +68,28 @@ impl Known {
         }
     }
 
-    /// Pairs what is known; each of `answers` whose topics are known already: the rest may come.
-    pub(super) fn find(&self, answers: Option<&[Pair]>) -> qos::Found {
-        let (inputs, outputs) = (topics(&self.inputs), topics(&self.outputs));
-        let Some(answers) = answers else {
-            return qos::find(&inputs, &outputs, None).unwrap_or_default();
-        };
-        let mut found = qos::Found::default();
-        for pair in answers {
-            match qos::find(&inputs, &outputs, Some(std::slice::from_ref(pair))) {
-                Ok(one) => found.pairs.extend(one.pairs),
-                Err(reason) => tracing::debug!(reason, "no request yet"),
+    /// The pairs of those requests whose topics exist, and of actions that none of them names.
+    pub(super) fn pairs(&self, requests: &[Request]) -> Vec<Pair> {
+        let mut pairs: Vec<Pair> = Vec::new();
+        for found in requests.iter().filter_map(|request| request.pair(self)) {
+            match pairs.iter_mut().find(|pair| pair.input == found.input) {
+                // Nodes of one program may answer the same input.
+                Some(pair) => {
+                    let outputs = found.outputs.into_iter();
+                    let new: Vec<_> = outputs
+                        .filter(|name| !pair.outputs.contains(name))
+                        .collect();
+                    pair.outputs.extend(new);
+                }
+                None => pairs.push(found),
             }
         }
-        found
+        for action in requests::actions(self) {
+            if !pairs.iter().any(|pair| pair.input == action.input) {
+                pairs.push(action);
+            }
+        }
+        pairs
     }
 }
 
@@ -88,15 +97,6 @@ impl Known {
 fn is_below(name: &str, node: &str) -> bool {
     name.strip_prefix(node)
         .is_some_and(|rest| rest.starts_with('/'))
-}
-
-fn topics(known: &BTreeMap<String, WireType>) -> Vec<Topic> {
-    let topic = |(name, wire_type): (&String, &WireType)| Topic {
-        name: name.clone(),
-        type_name: wire_type.name.replacen("/msg/", "/", 1),
-        stamped: local::is_stamped(wire_type),
-    };
-    known.iter().map(topic).collect()
 }
 
 #[cfg(test)]
@@ -161,28 +161,5 @@ mod tests {
         let found = note(&["/see", "/tf_2"], &[], true);
         let others = "/tf_2/x /tf_2/x/get_type_description".to_owned();
         assert_eq!(found, ("/see/eye/scan /tf /tf_2/x".to_owned(), others));
-    }
-
-    #[test]
-    fn requests_are_known_one_by_one() {
-        let mut known = Known::default();
-        let pairs = ["/a -> /b", "/c -> /d"].map(|pair| pair.parse().unwrap());
-        let topic = |name: &str| (name.to_owned(), WireType::named("std_msgs/String"));
-        known.inputs.extend([topic("/a"), topic("/c")]);
-        known.outputs.extend([topic("/b")]);
-        let found = |known: &Known| {
-            let found = known.find(Some(&pairs));
-            found
-                .pairs
-                .iter()
-                .map(ToString::to_string)
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(found(&known), ["/a -> /b by arrival"]);
-        known.outputs.extend([topic("/d")]);
-        assert_eq!(
-            found(&known),
-            ["/a -> /b by arrival", "/c -> /d by arrival"]
-        );
     }
 }

@@ -18,6 +18,7 @@ use super::Mirror;
 use super::diagnostics::Diagnostics;
 use super::known::Known;
 use super::reports::{self, Reports};
+use super::requests::Request;
 use super::safe_stop::{self, Stop};
 use crate::config::{self, Config};
 use crate::local::{Answer, Application, Cloud, Interface, Keeper, Original, Setting};
@@ -123,11 +124,13 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
 
 impl Mirror {
     /// Keeps the promise of `sla` from now on, or stands by for a lost link where it promises nothing, with the local original that `setting` tells of; how it stands is
-    /// shown by `diagnostics`. A safe stop of a declared type is published by `watcher`.
+    /// shown by `diagnostics`. Where `sla` does not say which input is answered by which output, it is as `decided` at
+    /// the push. A safe stop of a declared type is published by `watcher`.
     pub async fn promise(
         self: &Arc<Self>,
         sla: Sla,
         setting: Setting,
+        decided: Vec<Request>,
         diagnostics: Diagnostics,
         watcher: &Arc<dyn Bus>,
     ) -> anyhow::Result<()> {
@@ -143,7 +146,8 @@ impl Mirror {
         };
         let of_link = sla.is_of_link();
         let way = Arc::new(Way(Arc::downgrade(self)));
-        let answers = sla.answers.clone();
+        let stated = sla.answers.as_ref();
+        let stated = stated.map(|pairs| pairs.iter().map(Request::stated).collect());
         let sla_stop = sla.safe_stop.clone();
         let keeper = Keeper::start(sla, Vec::new(), original, way.clone(), way);
         let stop = match sla_stop {
@@ -153,7 +157,7 @@ impl Mirror {
         let _ = self.promise.set(Promise {
             keeper: keeper.clone(),
             of_link,
-            answers,
+            requests: stated.unwrap_or(decided),
             known: Mutex::default(),
             reports: Reports::default(),
             stop,
@@ -173,7 +177,7 @@ impl Mirror {
         self.promise.get().map(|promise| &promise.keeper)
     }
 
-    /// The graph has changed: there may be more to pair. `settled`: what it does not list is gone.
+    /// The graph has changed: the topics of more requests may exist. `settled`: what it does not list is gone.
     pub(super) async fn learn(&self, graph: &Graph, settled: bool) {
         let Some(promise) = self.promise.get() else {
             return;
@@ -184,18 +188,28 @@ impl Mirror {
             known.note(graph, self.bus.node(), settled, wire_type);
             let types = known.inputs.values().chain(known.outputs.values());
             promise.keeper.learn_types(types);
-            let mut found = known.find(promise.answers.as_deref());
+            let mut pairs = known.pairs(&promise.requests);
+            if settled
+                && pairs.is_empty()
+                && !promise.requests.is_empty()
+                && known.told.insert(String::new())
+            {
+                tracing::warn!(
+                    "this node has none of the topics that the service's push found to be answered: their times are not judged; say which are, with \
+                     request = \"/INPUT -> /OUTPUT\" in stub.toml"
+                );
+            }
             if promise.of_link {
                 // A goal is done by one side or the other; of all else only who speaks counts.
                 let of_action = |pair: &Pair| pair.by == Some(Correlation::Goal);
-                found.pairs.retain(of_action);
+                pairs.retain(of_action);
             }
-            for pair in &found.pairs {
+            for pair in &pairs {
                 if known.told.insert(pair.to_string()) {
                     tracing::info!("requests and answers: {pair}");
                 }
             }
-            let answered = |name: &&String| found.pairs.iter().any(|pair| pair.input == **name);
+            let answered = |name: &&String| pairs.iter().any(|pair| pair.input == **name);
             let interface = Interface {
                 inputs: known.inputs.clone(),
                 asked: known.asked.clone(),
@@ -208,7 +222,7 @@ impl Mirror {
                     .collect(),
                 of_others: known.of_others.keys().cloned().collect(),
             };
-            (found.pairs, interface)
+            (pairs, interface)
         };
         if let Err(error) = promise.keeper.learn(pairs, interface).await {
             tracing::warn!("the local original cannot be fed: {error:#}");
@@ -221,7 +235,8 @@ pub struct Promise {
     keeper: Arc<Keeper>,
     /// No time is promised: the link alone decides.
     of_link: bool,
-    answers: Option<Vec<Pair>>,
+    /// Which inputs are answered by which outputs.
+    requests: Vec<Request>,
     known: Mutex<Known>,
     pub(super) reports: Reports,
     /// Ready to be published; none where it is zeros on an output of the node.

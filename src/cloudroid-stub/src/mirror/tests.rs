@@ -343,7 +343,7 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
     let relay = setting(&scene.robot, &["patient"]);
     let promised = scene
         .mirror
-        .promise(sla, relay, diagnostics.unwrap(), &watcher);
+        .promise(sla, relay, Vec::new(), diagnostics.unwrap(), &watcher);
     promised.await.unwrap();
     let app = scene.robot.node("/app").await;
     let (input, mut out) = (

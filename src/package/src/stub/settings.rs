@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::{About, Words};
+use super::{About, Answered, Words};
 
 /// The robot's settings, with what may be added.
 pub(super) fn stub(about: &About<'_>) -> String {
@@ -51,6 +51,8 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         names: &'a BTreeMap<String, String>,
         #[serde(skip_serializing_if = "Option::is_none")]
         defaults: Option<Defaults>,
+        #[serde(skip_serializing_if = "<[_]>::is_empty")]
+        requests: &'a [Answered],
     }
     /// What holds where the robot says nothing: not in `stub.toml`, which an installation keeps.
     #[derive(Serialize)]
@@ -69,6 +71,7 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         original: executables.difference(about.outsourced).collect(),
         names: about.names,
         defaults: about.times.map(|(desire, max)| Defaults { desire, max }),
+        requests: about.requests,
     };
     let text = toml::to_string(&revision).expect("texts and a number are TOML");
     format!(

@@ -87,6 +87,11 @@ fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Fil
         names: &[("node".to_owned(), "names_itself".to_owned())].into(),
         interface: &interface,
         stateful: true,
+        requests: &[Answered {
+            node: "/node".into(),
+            program: Some("node".into()),
+            request: "/in -> /out by stamp".parse().expect("a pair"),
+        }],
         times: Some((0.1, 0.3)),
     };
     compose(&about, contents).expect("a stub")
@@ -175,6 +180,9 @@ fn settings_and_origin_are_told_in_toml() {
         (Some(0.1), Some(0.3))
     );
     assert!(stub.get("desire").is_none(), "that is the robot's own");
+    let request = &revision["requests"][0];
+    let said = ["node", "program", "request"].map(|key| request[key].as_str().expect("a text"));
+    assert_eq!(said, ["/node", "node", "/in -> /out by stamp"]);
 }
 
 #[test]
@@ -228,6 +236,7 @@ fn without_a_manifest_there_is_no_stub() {
         names: &BTreeMap::new(),
         interface: &interface,
         stateful: true,
+        requests: &[],
         times: None,
     };
     let error = compose(&about, Contents::default()).expect_err("refused");

@@ -142,9 +142,10 @@ async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
                 patience: SOON,
             };
             let sla = Sla::parse(sla).unwrap();
-            let promise = scene
-                .mirror
-                .promise(sla, setting, diagnostics.unwrap(), &watcher);
+            let promise =
+                scene
+                    .mirror
+                    .promise(sla, setting, Vec::new(), diagnostics.unwrap(), &watcher);
             promise.await.unwrap();
         }
         let (sender, mut goals) = mpsc::unbounded_channel();

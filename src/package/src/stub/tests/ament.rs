@@ -311,6 +311,7 @@ fn ros_2_s_own_tools_find_the_stub_before_the_original() {
         names: &BTreeMap::new(),
         interface: &Interface::default(),
         stateful: false,
+        requests: &[],
         times: None,
     };
     let (overlay, original) = (place.join("overlay"), place.join("original"));
