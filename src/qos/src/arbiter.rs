@@ -1,10 +1,15 @@
 //! For each request: who was asked, who answered first, what is a late duplicate.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+mod record;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::channel::Channel;
 use crate::request::{Key, Leg, RequestId, Side};
+
+pub(crate) use record::{Kind, Record};
 
 /// What is kept, and for how long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -12,8 +17,7 @@ pub struct Limits {
     /// After its T_max a request is remembered for so long: late answers are recognised, and an input that nobody
     /// answered is given up.
     pub patience: Duration,
-    /// Requests remembered; beyond it the oldest inputs are forgotten. Calls and goals are not counted: each holds a
-    /// caller.
+    /// Requests remembered; beyond it the oldest that came on topics are forgotten. Those that hold a caller are not counted.
     pub requests: usize,
 }
 
@@ -38,30 +42,18 @@ pub enum Verdict {
     Drop,
 }
 
-/// What kind of request it is.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Kind {
-    /// A service call: exactly one result.
-    Call(Arc<str>),
-    /// A goal of an action: exactly one result. It may take long, and whoever has taken it carries it out while the way there
-    /// is lost.
-    Goal(Arc<str>),
-    /// An input of the pair with this index.
-    Input {
-        pair: usize,
-        key: Option<Key>,
-        /// Outputs that answer it; the first one is the answer.
-        outputs: usize,
-    },
-}
+/// At T_max an answer is still in time.
+const PAST: Duration = Duration::from_nanos(1);
 
 /// The requests of one node that are open or were until lately. `P` is what was asked, cheap to clone.
 #[derive(Debug)]
-pub struct Arbiter<P> {
+pub(crate) struct Arbiter<P> {
     limits: Limits,
     next: u64,
     requests: BTreeMap<RequestId, Record<P>>,
-    /// How many of them are inputs.
+    /// Those whose answers are recognised by a key, by the name of their channel.
+    keyed: HashMap<(Arc<str>, Key), RequestId>,
+    /// How many of them hold no caller.
     inputs: usize,
     /// One for each of them ([`Record::timer`]): its T_max, or the end of its patience.
     timers: BTreeSet<(Instant, RequestId)>,
@@ -69,124 +61,69 @@ pub struct Arbiter<P> {
     stragglers: VecDeque<RequestId>,
 }
 
-#[derive(Debug)]
-pub(crate) struct Record<P> {
-    pub(crate) kind: Kind,
-    /// Until it is answered, failed, or, for inputs, too old to be asked anew.
-    pub(crate) payload: Option<P>,
-    pub(crate) asked_at: Instant,
-    pub(crate) deadline: Instant,
-    /// When it is looked at again.
-    timer: Instant,
-    pub(crate) cloud: Leg,
-    pub(crate) local: Leg,
-    /// Whose answer was taken, per output.
-    owners: Vec<Option<Side>>,
-    /// The application was told that there will be no answer.
-    pub(crate) failed: bool,
-    /// T_max has passed.
-    pub(crate) overdue: bool,
-    /// The cloud's time has counted, or that it had none.
-    pub(crate) judged: bool,
-    /// When the local original was asked.
-    pub(crate) local_asked: Option<Instant>,
-    /// The cloud's time, once it has answered.
-    pub(crate) cloud_time: Option<Duration>,
-    /// The time of the first answer.
-    pub(crate) answer_time: Option<Duration>,
-}
-
-impl<P> Record<P> {
-    pub(crate) fn leg(&mut self, side: Side) -> &mut Leg {
-        match side {
-            Side::Cloud => &mut self.cloud,
-            Side::Local => &mut self.local,
-        }
-    }
-
-    pub(crate) fn answered(&self) -> Option<Side> {
-        self.owners[0]
-    }
-
-    /// Neither answered nor failed.
-    pub(crate) fn is_open(&self) -> bool {
-        self.answered().is_none() && !self.failed
-    }
-
-    pub(crate) fn is_call(&self) -> bool {
-        matches!(self.kind, Kind::Call(_) | Kind::Goal(_))
-    }
-
-    fn awaits_nobody(&self) -> bool {
-        [&self.cloud, &self.local]
-            .iter()
-            .all(|leg| matches!(leg, Leg::NotAsked | Leg::Answered | Leg::Failed(_)))
-    }
-}
-
 impl<P: Clone> Arbiter<P> {
     /// Knows no request yet.
-    pub fn new(limits: Limits) -> Self {
+    pub(crate) fn new(limits: Limits) -> Self {
         Self {
             limits,
             next: 0,
             requests: BTreeMap::new(),
+            keyed: HashMap::new(),
             inputs: 0,
             timers: BTreeSet::new(),
             stragglers: VecDeque::new(),
         }
     }
 
-    /// A service was called, or a goal was sent. Nobody is asked yet.
-    pub fn call(
-        &mut self,
-        now: Instant,
-        t_max: Duration,
-        name: &Arc<str>,
-        payload: P,
-    ) -> RequestId {
-        self.open(now, t_max, Kind::Call(name.clone()), payload)
-    }
-
+    /// Something is to be asked, and nobody is asked yet. Answers are recognised by `key`, where they have one.
     pub(crate) fn open(
         &mut self,
-        now: Instant,
-        t_max: Duration,
+        (now, t_max): (Instant, Duration),
         kind: Kind,
+        channel: Channel,
+        key: Option<Key>,
         payload: P,
     ) -> RequestId {
         let id = RequestId(self.next);
         self.next += 1;
-        let outputs = match &kind {
-            Kind::Call(_) | Kind::Goal(_) => 1,
-            Kind::Input { outputs, .. } => *outputs,
-        };
         let deadline = now + t_max;
+        let key = key.map(|key| (channel.name().clone(), key));
+        if let Some(key) = &key {
+            self.keyed.insert(key.clone(), id);
+        }
         let record = Record {
             kind,
+            channel,
+            key,
             payload: Some(payload),
             asked_at: now,
             deadline,
-            // At T_max it is still in time.
-            timer: deadline + Duration::from_nanos(1),
+            timer: deadline + PAST,
             cloud: Leg::NotAsked,
             local: Leg::NotAsked,
-            owners: vec![None; outputs],
+            owners: vec![None],
             failed: false,
             overdue: false,
+            missed: false,
+            taken: false,
             judged: false,
             local_asked: None,
             cloud_time: None,
             answer_time: None,
         };
-        self.inputs += usize::from(!record.is_call());
+        self.inputs += usize::from(!record.has_caller());
         self.timers.insert((record.timer, id));
         self.requests.insert(id, record);
         id
     }
 
+    /// The request on the channel of this name whose answers are recognised by `key`.
+    pub(crate) fn keyed(&self, name: &Arc<str>, key: &Key) -> Option<RequestId> {
+        self.keyed.get(&(name.clone(), key.clone())).copied()
+    }
+
     /// Marks `side` as asked and gives what to ask, unless it was asked already or the request needs nobody.
-    pub fn ask(&mut self, now: Instant, id: RequestId, side: Side) -> Option<P> {
+    pub(crate) fn ask(&mut self, now: Instant, id: RequestId, side: Side) -> Option<P> {
         let record = self.requests.get_mut(&id)?;
         if !record.is_open() || !matches!(record.leg(side), Leg::NotAsked) {
             return None;
@@ -199,13 +136,6 @@ impl<P: Clone> Arbiter<P> {
         Some(payload)
     }
 
-    /// `side` gave the result of a call, or the answering output of an input.
-    pub fn answer(&mut self, now: Instant, id: RequestId, side: Side) -> Verdict {
-        let verdict = self.answer_with(now, id, side, 0);
-        self.close_call(id);
-        verdict
-    }
-
     /// `side` gave output number `output`. The side that is first with it keeps it: a node that answers one input
     /// with several messages on a topic is passed as it is. A call is remembered until it is closed.
     pub(crate) fn answer_with(
@@ -215,9 +145,7 @@ impl<P: Clone> Arbiter<P> {
         side: Side,
         output: usize,
     ) -> Verdict {
-        // The pair may have got further outputs since the request was made.
-        let known = |record: &&mut Record<P>| output < record.owners.len();
-        let Some(record) = self.requests.get_mut(&id).filter(known) else {
+        let Some(record) = self.requests.get_mut(&id) else {
             return Verdict::Drop;
         };
         let took = now.saturating_duration_since(record.asked_at);
@@ -227,13 +155,17 @@ impl<P: Clone> Arbiter<P> {
                 record.cloud_time.get_or_insert(took);
             }
         }
-        let call = record.is_call();
+        // Feedback of a goal is as many messages as its side likes.
+        let is_single = record.is_call() && output == 0;
         let failed = record.failed;
+        // The pair may have got further outputs since the request was made.
+        let outputs = record.owners.len().max(output + 1);
+        record.owners.resize(outputs, None);
         let owner = &mut record.owners[output];
         let verdict = match *owner {
             _ if failed => Verdict::Drop,
             None => Verdict::Deliver,
-            Some(first) if first == side && !call => Verdict::Deliver,
+            Some(first) if first == side && !is_single => Verdict::Deliver,
             Some(_) => Verdict::Drop,
         };
         if verdict == Verdict::Deliver {
@@ -247,7 +179,7 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// `side` cannot answer. Whether that fails the request is for the caller to say, who knows what else may come.
-    pub fn failed(&mut self, id: RequestId, side: Side, reason: &str) {
+    pub(crate) fn failed(&mut self, id: RequestId, side: Side, reason: &str) {
         if let Some(record) = self.requests.get_mut(&id) {
             if *record.leg(side) != Leg::Answered {
                 *record.leg(side) = Leg::Failed(reason.to_owned());
@@ -257,7 +189,7 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// Gives the request up. True for the first time, and only where it was not answered.
-    pub fn fail(&mut self, id: RequestId) -> bool {
+    pub(crate) fn fail(&mut self, id: RequestId) -> bool {
         let Some(record) = self.requests.get_mut(&id).filter(|record| record.is_open()) else {
             return false;
         };
@@ -268,14 +200,19 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// Nobody wants the answer any more; what comes is dropped.
-    pub fn cancel(&mut self, id: RequestId) {
+    pub(crate) fn cancel(&mut self, id: RequestId) {
         self.remove(id);
     }
 
     fn remove(&mut self, id: RequestId) -> Option<Record<P>> {
         let record = self.requests.remove(&id)?;
         self.timers.remove(&(record.timer, id));
-        self.inputs -= usize::from(!record.is_call());
+        self.inputs -= usize::from(!record.has_caller());
+        // The key may be another's by now: a goal that is sent again, once it has ended.
+        let key = record.key.as_ref();
+        if let Some(key) = key.filter(|key| self.keyed.get(key) == Some(&id)) {
+            self.keyed.remove(key);
+        }
         Some(record)
     }
 
@@ -297,6 +234,10 @@ impl<P: Clone> Arbiter<P> {
             record.cloud_time = record.cloud_time.or(time);
             !std::mem::replace(&mut record.judged, true)
         })
+    }
+
+    pub(crate) fn get_mut(&mut self, id: RequestId) -> Option<&mut Record<P>> {
+        self.requests.get_mut(&id)
     }
 
     pub(crate) fn get(&self, id: RequestId) -> Option<&Record<P>> {
@@ -328,7 +269,8 @@ impl<P: Clone> Arbiter<P> {
     pub(crate) fn straggler(&mut self) -> Option<RequestId> {
         while let Some(id) = self.stragglers.front().copied() {
             let waits = |record: &Record<P>| {
-                record.is_open() && record.payload.is_some() && record.local == Leg::NotAsked
+                let is_free = record.local == Leg::NotAsked && record.cloud != Leg::LeftOut;
+                record.is_open() && record.payload.is_some() && is_free
             };
             if self.requests.get(&id).is_some_and(waits) {
                 return Some(id);
@@ -339,7 +281,7 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// When [`expire`](Self::expire) has something to say.
-    pub fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         self.timers.first().map(|(at, _)| *at)
     }
 
@@ -348,29 +290,37 @@ impl<P: Clone> Arbiter<P> {
         self.inputs > self.limits.requests
     }
 
-    /// Requests whose T_max has passed since the last call, and those that are forgotten now.
-    pub(crate) fn expire(&mut self, now: Instant) -> (Vec<RequestId>, Vec<(RequestId, Record<P>)>) {
+    /// Requests whose T_max has passed since the last call, with those whose callers wait still, and those that are forgotten now.
+    /// `put_off` gives until when one may turn out to have been left out.
+    pub(crate) fn expire(
+        &mut self,
+        now: Instant,
+        put_off: impl Fn(RequestId, &Record<P>) -> Option<Instant>,
+    ) -> (Vec<RequestId>, Vec<(RequestId, Record<P>)>) {
         let (mut overdue, mut forgotten) = (Vec::new(), Vec::new());
         while let Some((at, id)) = self.timers.first().copied().filter(|(at, _)| *at <= now) {
+            self.timers.pop_first();
             let Some(record) = self.requests.get_mut(&id) else {
-                self.timers.pop_first();
                 continue;
             };
-            if !record.overdue {
+            let until = put_off(id, record).map(|until| until + PAST);
+            if let Some(until) = until.filter(|until| !record.overdue && *until > now) {
+                record.timer = until;
+            } else if !record.overdue {
                 record.overdue = true;
                 if !record.is_call() && record.payload.is_some() {
                     self.stragglers.push_back(id);
                 }
                 record.timer = at + self.limits.patience;
+                overdue.push(id);
             } else if record.is_call() && record.is_open() {
                 // Somebody waits for it, as long as it takes. Whether it can come at all is looked at again later.
                 record.timer = now + self.limits.patience;
+                overdue.push(id);
             } else {
                 forgotten.extend(self.remove(id).map(|record| (id, record)));
                 continue;
             }
-            overdue.push(id);
-            self.timers.pop_first();
             self.timers.insert((record.timer, id));
         }
         while self.stragglers.len() > STRAGGLERS {
@@ -381,7 +331,10 @@ impl<P: Clone> Arbiter<P> {
         }
         if self.is_crowded() {
             let crowd = self.inputs - self.limits.requests;
-            let inputs = self.requests.iter().filter(|(_, record)| !record.is_call());
+            let inputs = self
+                .requests
+                .iter()
+                .filter(|(_, record)| !record.has_caller());
             let oldest: Vec<RequestId> = inputs.map(|(id, _)| *id).take(crowd).collect();
             for id in oldest {
                 forgotten.extend(self.remove(id).map(|record| (id, record)));
@@ -395,50 +348,57 @@ impl<P: Clone> Arbiter<P> {
 mod tests {
     use super::*;
 
-    fn arbiter() -> (Arbiter<u8>, Arc<str>, Instant) {
-        (
-            Arbiter::new(Limits::default()),
-            "/add".into(),
-            Instant::now(),
-        )
+    fn arbiter() -> (Arbiter<u8>, Instant) {
+        (Arbiter::new(Limits::default()), Instant::now())
+    }
+
+    fn call(arbiter: &mut Arbiter<u8>, now: Instant) -> RequestId {
+        let channel = Channel::Call("/add".into());
+        arbiter.open((now, MAX), Kind::Call, channel, None, 7)
+    }
+
+    fn input(arbiter: &mut Arbiter<u8>, now: Instant) -> RequestId {
+        let channel = Channel::Topic("/in".into());
+        arbiter.open((now, MAX), Kind::Input(0), channel, None, 7)
+    }
+
+    fn answer(arbiter: &mut Arbiter<u8>, now: Instant, id: RequestId, side: Side) -> Verdict {
+        let verdict = arbiter.answer_with(now, id, side, 0);
+        arbiter.close_call(id);
+        verdict
     }
 
     const MAX: Duration = Duration::from_millis(100);
 
     #[test]
     fn the_first_result_wins_and_the_second_is_dropped() {
-        let (mut arbiter, name, now) = arbiter();
-        let id = arbiter.call(now, MAX, &name, 7);
+        let (mut arbiter, now) = arbiter();
+        let id = call(&mut arbiter, now);
         assert_eq!(arbiter.ask(now, id, Side::Cloud), Some(7));
         assert_eq!(arbiter.ask(now, id, Side::Cloud), None, "asked once");
         assert_eq!(arbiter.ask(now, id, Side::Local), Some(7));
-        assert_eq!(arbiter.answer(now, id, Side::Local), Verdict::Deliver);
-        assert_eq!(arbiter.answer(now, id, Side::Local), Verdict::Drop);
-        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(answer(&mut arbiter, now, id, Side::Local), Verdict::Deliver);
+        assert_eq!(answer(&mut arbiter, now, id, Side::Local), Verdict::Drop);
+        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
         assert!(arbiter.get(id).is_none(), "both have spoken: it is over");
-        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
     }
 
     #[test]
     fn an_answer_after_the_failure_is_dropped() {
-        let (mut arbiter, name, now) = arbiter();
-        let id = arbiter.call(now, MAX, &name, 7);
+        let (mut arbiter, now) = arbiter();
+        let id = call(&mut arbiter, now);
         arbiter.ask(now, id, Side::Cloud);
         assert!(arbiter.fail(id));
         assert!(!arbiter.fail(id));
-        assert_eq!(arbiter.answer(now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
         assert!(arbiter.requests.is_empty());
     }
 
     #[test]
     fn one_input_may_have_several_messages_of_one_side() {
-        let (mut arbiter, _, now) = arbiter();
-        let kind = Kind::Input {
-            pair: 0,
-            key: None,
-            outputs: 2,
-        };
-        let id = arbiter.open(now, MAX, kind, 7);
+        let (mut arbiter, now) = arbiter();
+        let id = input(&mut arbiter, now);
         arbiter.ask(now, id, Side::Cloud);
         arbiter.ask(now, id, Side::Local);
         assert_eq!(
@@ -459,30 +419,25 @@ mod tests {
 
     #[test]
     fn memory_is_bounded_and_waiting_callers_are_not_forgotten() {
-        let (_, name, now) = arbiter();
+        let now = Instant::now();
         let limits = Limits {
             patience: Duration::from_secs(1),
             requests: 10,
         };
         let mut arbiter = Arbiter::new(limits);
-        let call = arbiter.call(now, MAX, &name, 7);
+        let call = call(&mut arbiter, now);
         for _ in 0..1000 {
-            let kind = Kind::Input {
-                pair: 0,
-                key: None,
-                outputs: 1,
-            };
-            arbiter.open(now, MAX, kind, 7);
-            arbiter.expire(now);
+            input(&mut arbiter, now);
+            arbiter.expire(now, |_, _| None);
             assert!(arbiter.inputs <= 10, "{}", arbiter.inputs);
             assert_eq!(arbiter.requests.len(), arbiter.inputs + 1);
             assert_eq!(arbiter.timers.len(), arbiter.requests.len());
         }
-        let (overdue, _) = arbiter.expire(now + MAX);
+        let (overdue, _) = arbiter.expire(now + MAX, |_, _| None);
         assert!(overdue.is_empty(), "at T_max it is still in time");
-        let (overdue, _) = arbiter.expire(now + MAX * 2);
+        let (overdue, _) = arbiter.expire(now + MAX * 2, |_, _| None);
         assert!(overdue.contains(&call));
-        let (_, forgotten) = arbiter.expire(now + Duration::from_secs(60));
+        let (_, forgotten) = arbiter.expire(now + Duration::from_secs(60), |_, _| None);
         assert!(forgotten.iter().all(|(id, _)| *id != call));
         assert_eq!(arbiter.requests.len(), 1);
     }

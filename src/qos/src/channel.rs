@@ -10,3 +10,11 @@ pub enum Channel {
     /// A topic, by absolute name.
     Topic(Arc<str>),
 }
+
+impl Channel {
+    /// The absolute name.
+    pub fn name(&self) -> &Arc<str> {
+        let (Self::Call(name) | Self::Topic(name)) = self;
+        name
+    }
+}

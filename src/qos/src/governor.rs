@@ -6,6 +6,7 @@ mod frames;
 mod giving_up;
 mod judging;
 mod original;
+mod queue;
 mod standing;
 mod stream;
 
@@ -147,18 +148,36 @@ impl<P: Clone> Governor<P> {
 
     /// The application calls a service.
     pub fn call(&mut self, now: Instant, name: &Arc<str>, payload: P) -> RequestId {
-        self.open(now, name, Kind::Call(name.clone()), payload)
+        self.open(now, Kind::Call, Channel::Call(name.clone()), None, payload)
     }
 
-    /// The application sends a goal of an action that is made of calls (ROS 2). Its result answers it.
-    pub fn goal(&mut self, now: Instant, action: &Arc<str>, payload: P) -> RequestId {
-        self.open(now, action, Kind::Goal(action.clone()), payload)
+    /// The application sends a goal of an action that is made of calls (ROS 2), with its id. Its result answers it.
+    pub fn goal(&mut self, now: Instant, action: &Arc<str>, id: Key, payload: P) -> RequestId {
+        let channel = Channel::Call(action.clone());
+        self.open(now, Kind::Goal, channel, Some(id), payload)
     }
 
-    fn open(&mut self, now: Instant, name: &str, kind: Kind, payload: P) -> RequestId {
+    /// A side has accepted a goal: it is being carried out, however long that takes.
+    pub fn accepted(&mut self, now: Instant, id: RequestId) {
         self.tick(now);
-        let t_max = self.sla.times(name).t_max;
-        let id = self.arbiter.open(now, t_max, kind, payload);
+        if let Some(record) = self.arbiter.get_mut(id) {
+            record.taken = true;
+        }
+    }
+
+    fn open(
+        &mut self,
+        now: Instant,
+        kind: Kind,
+        channel: Channel,
+        key: Option<Key>,
+        payload: P,
+    ) -> RequestId {
+        self.tick(now);
+        let times = self.sla.times(channel.name());
+        let id = self
+            .arbiter
+            .open((now, times.t_max), kind, channel, key, payload);
         self.asked(now, id);
         id
     }
@@ -172,43 +191,31 @@ impl<P: Clone> Governor<P> {
     /// The application publishes an input; its answer is recognised by `key`, where it has one.
     pub fn input(&mut self, now: Instant, topic: &Arc<str>, key: Option<Key>, payload: P) {
         self.tick(now);
-        let Some(index) = self
-            .pairs
-            .iter()
-            .position(|stream| *stream.input == **topic)
-        else {
-            for side in self.told_sides() {
-                self.give(side, None, Channel::Topic(topic.clone()), payload.clone());
-            }
-            return;
+        let mut pairs = self.pairs.iter();
+        let Some(index) = pairs.position(|stream| *stream.input == **topic) else {
+            return self.pass_on(topic, &payload);
         };
-        let stream = &mut self.pairs[index];
-        let key = key.filter(|key| stream.by.takes(key));
-        let free = |side: Side| stream.outstanding[side.index()].is_none();
-        let busy = match &key {
-            Some(key) => stream.keys.contains_key(key),
+        let by = self.pairs[index].by;
+        let key = key.filter(|key| by.takes(key));
+        let kind = match by {
+            Correlation::Goal => Kind::Goal,
+            _ => Kind::Input(index),
+        };
+        let is_request = match &key {
+            Some(key) => self.arbiter.keyed(topic, key).is_none(),
             // Its server makes up the id: nothing tells which result is its own.
-            None if stream.by == Correlation::Goal => true,
-            None => !(free(Side::Cloud) || self.decider.is_fed() && free(Side::Local)),
+            None if kind == Kind::Goal => false,
+            None => (self.told_sides().iter()).any(|side| self.is_free(index, side)),
         };
-        if busy {
-            // Not a request of its own: the same stamp again, or, by arrival, one is outstanding already.
-            for side in self.told_sides() {
-                self.give(side, None, Channel::Topic(topic.clone()), payload.clone());
-            }
-            return;
+        if !is_request {
+            // The same stamp again, or, by arrival, one is outstanding already.
+            return self.pass_on(topic, &payload);
         }
-        let kind = Kind::Input {
-            pair: index,
-            key: key.clone(),
-            outputs: stream.pair.outputs.len(),
-        };
-        let t_max = self.sla.times(topic).t_max;
-        let id = self.arbiter.open(now, t_max, kind, payload);
-        if let Some(key) = key {
-            self.pairs[index].keys.insert(key, id);
+        if let Some(Key::Stamp(stamp)) = &key {
+            self.pairs[index].first.get_or_insert(*stamp);
         }
-        self.asked(now, id);
+        let channel = Channel::Topic(topic.clone());
+        self.open(now, kind, channel, key, payload);
     }
 
     /// An input that the cloud has by another way: it is for the local original, if that is fed.
@@ -259,7 +266,7 @@ impl<P: Clone> Governor<P> {
         if side == Side::Cloud {
             self.measure(now, topic, age);
         }
-        let verdict = match self.request_of(side, topic, key) {
+        let verdict = match self.request_of(now, side, topic, key) {
             Some((id, output)) => self.completed(now, side, id, output),
             // Nobody asked for it: only who speaks for the node at the moment is heard.
             None => {
@@ -299,6 +306,11 @@ impl<P: Clone> Governor<P> {
             self.decider.calm();
         }
         let next = if resumed { Leg::Asked } else { Leg::NotAsked };
+        if !resumed {
+            for stream in &mut self.pairs {
+                stream.queues[Side::Cloud.index()].waiting.clear();
+            }
+        }
         // A stateful service that is new has forgotten what it was asked; asking again could do it twice.
         let anew = resumed || self.sla.mode == Mode::Stateless;
         if anew {
@@ -363,21 +375,14 @@ impl<P: Clone> Governor<P> {
             self.away_at = None;
             self.away = true;
         }
+        let pairs = &self.pairs;
+        let (overdue, forgotten) = self.arbiter.expire(now, |id, record| match record.kind {
+            Kind::Input(pair) => pairs[pair].may_be_left_out(id, record),
+            _ => None,
+        });
         let mut stop = false;
-        let (overdue, forgotten) = self.arbiter.expire(now);
-        for id in overdue.iter().copied() {
-            self.judge(id, None);
-            for stream in &mut self.pairs {
-                for side in 0..2 {
-                    if stream.outstanding[side] == Some(id) {
-                        stream.owed[side] = stream.outstanding[side].take();
-                    }
-                }
-            }
-            if self.arbiter.get(id).is_some_and(Record::is_open) {
-                self.counts.unanswered_in_time += 1;
-                stop = true;
-            }
+        for id in &overdue {
+            stop |= self.passes_t_max(*id);
         }
         for (id, record) in forgotten {
             self.forget(id, record);

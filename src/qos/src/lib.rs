@@ -7,7 +7,7 @@
 //!   the time             ──▶ └──────────┘ ──▶ failures, safe stop, a report
 //! ```
 //! The parts, each usable alone: [`Sla`] is what the robot was promised; [`Satisfaction`] is the algorithm that judges
-//! the cloud; a [`Pair`] tells which input triggers which output; [`Arbiter`] knows for each request who was asked and
+//! the cloud; a [`Pair`] tells which input triggers which output; `Arbiter` knows for each request who was asked and
 //! who answered; [`Decider`] runs the local original; [`PhaseBook`] says where the time of a request goes. A
 //! [`Governor`] is all of them for one node.
 //!
@@ -42,7 +42,7 @@ mod sla;
 mod sla_error;
 mod span;
 
-pub use arbiter::{Arbiter, Limits, Verdict};
+pub use arbiter::{Limits, Verdict};
 pub use channel::Channel;
 pub use decider::{Decider, Event, LocalState, Why};
 pub use governor::{Effect, Governor};

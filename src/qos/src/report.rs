@@ -57,6 +57,9 @@ pub struct Counts {
     pub accepted: u64,
     /// The cloud did not answer by T_max.
     pub late: u64,
+    /// Inputs that the cloud left out, because its node was at another one: they count for nothing.
+    #[serde(default)]
+    pub left_out: u64,
     /// Answers that the application got from the cloud.
     pub from_cloud: u64,
     /// Answers that the application got from the local original.

@@ -68,6 +68,22 @@ pub struct Sides {
     pub local: bool,
 }
 
+impl Sides {
+    /// Each of them, the cloud first.
+    pub fn iter(self) -> impl Iterator<Item = Side> {
+        let both = [Side::Cloud, Side::Local].into_iter();
+        both.filter(move |side| self.has(*side))
+    }
+
+    /// Whether this side is one of them.
+    pub fn has(self, side: Side) -> bool {
+        match side {
+            Side::Cloud => self.cloud,
+            Side::Local => self.local,
+        }
+    }
+}
+
 /// How far one side is with one request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Leg {
@@ -77,6 +93,8 @@ pub enum Leg {
     Asked,
     /// It was asked, but the way to it was lost; an answer may still come if the link resumes.
     Lost,
+    /// It was given it and answered a later one, or was at an earlier one: no answer is awaited of it.
+    LeftOut,
     /// It answered.
     Answered,
     /// It cannot answer.

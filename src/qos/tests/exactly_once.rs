@@ -290,16 +290,16 @@ fn run(world: &mut World, ops: Vec<Op>) -> Result<(), TestCaseError> {
     let report = world.governor.report(world.now);
     let counts = report.counts;
     prop_assert_eq!(
-        counts.desired + counts.accepted + counts.late,
+        counts.desired + counts.accepted + counts.late + counts.left_out,
         counts.requests,
         "each request counts once"
     );
     prop_assert_eq!(
-        counts.from_cloud
-            >= counts
-                .requests
-                .saturating_sub(counts.failed + counts.from_local),
-        true
+        counts.from_cloud + counts.from_local + counts.failed + counts.left_out + counts.late
+            >= counts.requests,
+        true,
+        "{:?}",
+        counts
     );
     let text = serde_json::to_string(&report).unwrap();
     prop_assert_eq!(

@@ -81,7 +81,8 @@ impl Robot {
 
     fn goal(&mut self, payload: &'static str) -> RequestId {
         let action: Arc<str> = "/walk".into();
-        self.governor.goal(self.now, &action, payload)
+        let id = Key::Goal(payload.into());
+        self.governor.goal(self.now, &action, id, payload)
     }
 
     fn image(&mut self, secs: u32, payload: &'static str) {
@@ -801,5 +802,23 @@ fn a_goal_that_the_cloud_was_at_goes_on_at_the_local_original() {
     let said = robot.after(60_000);
     assert!(said.contains(&"walk to Local".to_owned()), "{said:?}");
     let verdict = robot.governor.answered(robot.now, Side::Local, goal);
+    assert_eq!(verdict, Verdict::Deliver);
+}
+
+#[test]
+fn a_goal_that_nobody_answers_for_minutes_stops_the_robot_once_and_one_that_is_accepted_never() {
+    let stop =
+        r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
+    let mut robot = Robot::new(json(stop));
+    robot.goal("walk");
+    robot.effects();
+    assert_eq!(robot.after(300_000), ["safe stop"]);
+    let accepted = robot.goal("run");
+    robot.governor.accepted(robot.now, accepted);
+    robot.effects();
+    assert!(robot.after(300_000).is_empty());
+    let counts = robot.governor.report(robot.now).counts;
+    assert_eq!((counts.unanswered_in_time, counts.late), (1, 2));
+    let verdict = robot.governor.answered(robot.now, Side::Cloud, accepted);
     assert_eq!(verdict, Verdict::Deliver);
 }

@@ -39,6 +39,7 @@ use std::time::{Duration, Instant};
 
 use budget::Budget;
 use parking_lot::Mutex;
+use qos::Span;
 use ros::bus::{Bus, Graph, ParamValue, RosVersion};
 use ros::schema::Registry;
 use ros::sizes::{Inputs, Seen};
@@ -520,10 +521,8 @@ fn session_options(sla: &Sla) -> SessionOptions {
         ping: Duration::from_secs(5),
         silent: Duration::from_secs(7),
         lost: Duration::from_secs(20),
-        max_age: sla
-            .max
-            .filter(|max| *max > 0.0)
-            .map(Duration::from_secs_f64),
+        // A robot may tell any number: beyond what a promise can be it promises nothing.
+        max_age: sla.max.and_then(Span::seconds).map(Span::duration),
     }
 }
 

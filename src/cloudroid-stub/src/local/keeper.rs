@@ -260,14 +260,10 @@ impl Keeper {
 
     fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
         let verdict = self.with(|state, now| {
-            match state.feedback(side, topic, message) {
-                Some(true) => return Verdict::Deliver,
-                Some(false) => return Verdict::Drop,
-                None => {}
-            }
             let stamp = state.stamps.of(message).filter(|stamp| !stamp.is_zero());
             let age = stamp.map(age).unwrap_or_default();
-            let key = state.stamps.key(message);
+            let key = goals::key_of_feedback(topic, message);
+            let key = key.or_else(|| state.stamps.key(message));
             let verdict = state.governor.output(now, side, topic, key, age);
             if let Some(phases) = phases {
                 state.governor.phases(&phases);

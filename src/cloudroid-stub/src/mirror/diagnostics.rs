@@ -118,6 +118,7 @@ fn values(report: &Report) -> Vec<(String, String)> {
     ];
     let late = [
         ("later than T_max by the cloud", counts.late.to_string()),
+        ("left out by the cloud's node", counts.left_out.to_string()),
         (
             "later than T_max by both",
             counts.unanswered_in_time.to_string(),

@@ -13,7 +13,8 @@ impl<P: Clone> Governor<P> {
         let Some(record) = self.arbiter.get(id) else {
             return;
         };
-        if !record.is_call() || !record.is_open() {
+        // Goals on topics have no caller to tell: they wait for whoever comes.
+        if !record.has_caller() || !record.is_open() {
             return;
         }
         let local = match &record.local {
@@ -29,7 +30,7 @@ impl<P: Clone> Governor<P> {
         let cloud = match &record.cloud {
             Leg::Failed(reason) => reason.clone(),
             // It is being carried out there, and its result comes when the link is back.
-            Leg::Lost if matches!(record.kind, Kind::Goal(_)) => return,
+            Leg::Lost if record.kind == Kind::Goal => return,
             Leg::NotAsked | Leg::Lost if !self.link && record.overdue => {
                 format!(
                     "the link is down and was not up again within {:?}",
@@ -38,7 +39,7 @@ impl<P: Clone> Governor<P> {
             }
             _ => return,
         };
-        let channel = self.channel(&record.kind);
+        let channel = record.channel.clone();
         self.give_up(id, channel, format!("cloud: {cloud}; local: {local}"));
     }
 
@@ -54,24 +55,17 @@ impl<P: Clone> Governor<P> {
     }
 
     pub(super) fn forget(&mut self, request: RequestId, record: Record<P>) {
-        let channel = self.channel(&record.kind);
-        if let Kind::Input { pair, key, .. } = &record.kind {
-            let stream = &mut self.pairs[*pair];
-            if let Some(key) = key {
-                stream.keys.remove(key);
-            }
-            for slot in stream.outstanding.iter_mut().chain(&mut stream.owed) {
-                if *slot == Some(request) {
-                    *slot = None;
-                }
+        if let Kind::Input(pair) = record.kind {
+            for queue in &mut self.pairs[pair].queues {
+                queue.waiting.retain(|waiting| *waiting != request);
             }
         }
-        if record.is_open() {
+        if record.is_open() && (record.missed || record.is_call() || !record.overdue) {
             self.counts.failed += 1;
             let reason = "nobody answered while it was remembered".to_owned();
             self.effects.push_back(Effect::Fail {
                 request,
-                channel,
+                channel: record.channel,
                 reason,
             });
         }

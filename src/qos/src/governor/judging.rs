@@ -21,11 +21,13 @@ impl<P: Clone> Governor<P> {
         id: RequestId,
         output: usize,
     ) -> Verdict {
-        let answers = output == 0
-            && self.arbiter.get(id).is_some_and(|record| match side {
-                Side::Cloud => record.cloud != Leg::Answered,
-                Side::Local => record.local != Leg::Answered,
-            });
+        let sides = self.sides();
+        let record = self.arbiter.get_mut(id);
+        if record.is_some_and(|record| !record.hears(side, output, sides)) {
+            return Verdict::Drop;
+        }
+        let record = self.arbiter.get_mut(id).filter(|_| output == 0);
+        let answers = record.is_some_and(|record| *record.leg(side) != Leg::Answered);
         if let Some(record) = self.arbiter.get(id).filter(|_| answers) {
             match (side, record.local_asked) {
                 (Side::Cloud, _) => {
@@ -39,6 +41,9 @@ impl<P: Clone> Governor<P> {
             }
         }
         let verdict = self.arbiter.answer_with(now, id, side, output);
+        if answers {
+            self.has_passed(now, side, id);
+        }
         if answers && verdict == Verdict::Deliver && self.sla.is_of_link() {
             // No time is promised that could pass: there is nothing more to learn about it.
             self.arbiter.judge(id, None);
@@ -71,14 +76,34 @@ impl<P: Clone> Governor<P> {
         }
     }
 
+    /// T_max of a request has passed. True where nobody has answered it, nor a later one in its place.
+    pub(super) fn passes_t_max(&mut self, id: RequestId) -> bool {
+        let Some(record) = self.arbiter.get_mut(id) else {
+            return false;
+        };
+        let mut is_left_out = record.cloud == Leg::LeftOut;
+        let is_told = record.failed || record.taken || record.missed;
+        let mut awaits = !is_told && !record.is_in_time();
+        if let Kind::Input(pair) = record.kind {
+            let stream = &self.pairs[pair];
+            is_left_out |= stream.is_beyond_telling(record);
+            awaits &= !stream.is_beyond_telling(record) && stream.passed <= Some(id);
+        }
+        record.missed |= awaits;
+        if !is_left_out {
+            self.judge(id, None);
+        } else if self.arbiter.judge(id, None) {
+            self.counts.left_out += 1;
+        }
+        self.counts.unanswered_in_time += u64::from(awaits);
+        awaits
+    }
+
     pub(super) fn count(&mut self, id: RequestId, t: Option<Duration>) {
         let Some(record) = self.arbiter.get(id) else {
             return;
         };
-        let times = match &record.kind {
-            Kind::Call(name) | Kind::Goal(name) => self.sla.times(name),
-            Kind::Input { pair, .. } => self.sla.times(&self.pairs[*pair].input),
-        };
+        let times = self.sla.times(record.channel.name());
         self.observe(t, times.t_desire, times.t_max);
     }
 
@@ -87,16 +112,13 @@ impl<P: Clone> Governor<P> {
         let Some(record) = self.arbiter.get(id).filter(|record| record.judged) else {
             return;
         };
-        let stamp = match record.kind {
-            Kind::Input {
-                key: Some(Key::Stamp(stamp)),
-                ..
-            } => Some(stamp),
+        let stamp = match record.key {
+            Some((_, Key::Stamp(stamp))) => Some(stamp),
             _ => None,
         };
         let outcome = Outcome {
             request: id,
-            channel: self.channel(&record.kind),
+            channel: record.channel.clone(),
             stamp,
             cloud: record.cloud_time,
             answer: record.answered().zip(record.answer_time),

@@ -44,6 +44,7 @@ impl<P: Clone> Governor<P> {
             let stream = &mut self.pairs[index];
             if stream.by == Correlation::Stamp && stream.unmatched.is_some_and(|n| n >= UNMATCHED) {
                 stream.by = Correlation::Arrival;
+                stream.queues = Default::default();
                 let input = stream.pair.input.clone();
                 self.say(now, Event::Uncorrelated(input));
             }
@@ -63,8 +64,7 @@ impl<P: Clone> Governor<P> {
         let reason = Leg::Failed("the local original ended".into());
         let lost = self.arbiter.turn(Side::Local, &Leg::Asked, &reason);
         for stream in &mut self.pairs {
-            stream.outstanding[Side::Local.index()] = None;
-            stream.owed[Side::Local.index()] = None;
+            stream.queues[Side::Local.index()].waiting.clear();
         }
         for id in lost {
             if self.link {

@@ -432,3 +432,18 @@ async fn asking_how_a_link_is_doing_holds_up_no_connection() {
     drop(held);
     assert_eq!(asking.join().expect("no panic").node, "/detect");
 }
+
+#[test]
+fn a_robot_may_tell_any_number_for_its_t_max() {
+    let max_age = |max| {
+        session_options(&Sla {
+            max: Some(max),
+            ..Sla::default()
+        })
+        .max_age
+    };
+    assert_eq!(max_age(0.3), Some(Duration::from_millis(300)));
+    for max in [1e300, f64::INFINITY, f64::NAN, -1.0, 0.0, 1e-300] {
+        assert_eq!(max_age(max), None, "{max}");
+    }
+}

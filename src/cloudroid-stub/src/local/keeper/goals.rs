@@ -20,12 +20,12 @@ use bytes::Bytes;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use link::clock;
-use qos::{Failure, RequestId, Side};
+use qos::{Failure, Key, RequestId, Side};
 use ros::bus::{Message, WireFormat};
 use tokio::sync::oneshot;
 
 use super::goal_messages::{self as messages, ALL, GoalId};
-use super::{Keeper, Payload, State};
+use super::{Keeper, Payload};
 
 /// Results are kept so long for those who ask for them late, and so many of them.
 const KEPT: Duration = Duration::from_secs(900);
@@ -63,8 +63,6 @@ struct Goal {
     canceled: bool,
     /// How often each side was given it.
     given: [u32; 2],
-    /// Whose feedback is passed on.
-    feedback: Option<Side>,
     /// Who waits for its result.
     waiting: Vec<oneshot::Sender<Bytes>>,
     result: Option<Bytes>,
@@ -81,7 +79,6 @@ impl Goal {
             sender: Some(sender),
             canceled: false,
             given: [0; 2],
-            feedback: None,
             waiting: Vec::new(),
             result: None,
             forgotten: None,
@@ -133,25 +130,16 @@ impl Goals {
     }
 }
 
-impl State {
-    /// Whether feedback of a side is passed on: that of the first one that gives any, as long as it is there. None where it is of a
-    /// goal that was not sent here, or something else.
-    pub(super) fn feedback(&mut self, side: Side, topic: &str, message: &Message) -> Option<bool> {
-        let of_action = message.wire_type.format == WireFormat::Cdr;
-        if !of_action || !topic.ends_with("/_action/feedback") {
-            return None;
-        }
-        let sides = self.governor.sides();
-        let goal = self.goals.0.get_mut(&messages::id_of(&message.bytes)?)?;
-        let is_there = |side: Side| match side {
-            Side::Cloud => sides.cloud,
-            Side::Local => sides.local,
-        };
-        let speaker = goal.feedback.filter(|side| is_there(*side));
-        let speaker = speaker.unwrap_or(side);
-        goal.feedback = Some(speaker);
-        Some(speaker == side)
-    }
+/// By what feedback of a goal is recognised.
+pub(super) fn key_of_feedback(topic: &str, message: &Message) -> Option<Key> {
+    let of_action =
+        message.wire_type.format == WireFormat::Cdr && topic.ends_with("/_action/feedback");
+    let id = messages::id_of(&message.bytes).filter(|_| of_action)?;
+    Some(key_of(&id))
+}
+
+fn key_of(id: &GoalId) -> Key {
+    Key::Goal(format!("{:032x}", u128::from_be_bytes(*id)).into())
 }
 
 impl Keeper {
@@ -177,7 +165,7 @@ impl Keeper {
             }
             state.ledger.told(now, action);
             let payload = Payload::Goal(Arc::new(sent));
-            let request = state.governor.goal(now, action, payload);
+            let request = state.governor.goal(now, action, key_of(&id), payload);
             state
                 .goals
                 .begin(now, id, Goal::new(request, action, sender));
@@ -344,6 +332,9 @@ impl Carrying {
 
     /// It is carried out. False where whoever sent it wants it no more.
     fn accepted(&self, answer: Bytes) -> bool {
+        if let Some(keeper) = self.keeper.upgrade() {
+            keeper.with(|state, now| state.governor.accepted(now, self.request));
+        }
         let is_wanted = self.with_goal(|goal| {
             if let Some(sender) = goal.sender.take() {
                 let _ = sender.send(answer);

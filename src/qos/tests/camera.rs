@@ -1,0 +1,616 @@
+//! A camera at its own rate, an action's goals, and two sides that answer as they can: the governor as a model, over random
+//! times of good and bad links, slow and silent nodes, lost pictures, new servants, crashes, and pairs that become known late.
+//!
+//! What holds, by stamp and by arrival, with a cold original, a warm one, and none:
+//! 1. There is no safe stop while anybody answers what it takes within T_max, however much its node leaves out.
+//! 2. Where a node that took every picture begins to leave some out, at most one of them counts as late for that, and at most one
+//!    safe stop is fired.
+//! 3. Where nobody answers any more, the safe stop comes at T_max after the first picture that was not answered; where the
+//!    node left pictures out until then, at T_max after its last answer at the latest.
+//! 4. By stamp nothing is answered by both sides. Of a goal, one result is delivered.
+//! 5. Each request counts once: as desired, accepted, late, or left out. What is left out moves neither Q nor the robot.
+//! 6. Feedback of a goal comes from one side at a time, and goes on after a hand-over.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use proptest::prelude::*;
+use qos::{
+    Channel, Counts, Effect, Event, Governor, Key, Limits, LocalState, Side, Sides, Sla, Stamp,
+    Verdict,
+};
+
+const MS: Duration = Duration::from_millis(1);
+const T_MAX: u64 = 300;
+/// A cold original is up after so many milliseconds.
+const STARTS: u64 = 700;
+/// Between two words of feedback, milliseconds.
+const FEEDBACK: u64 = 100;
+
+#[derive(Debug, Clone, Copy)]
+enum Sent {
+    Picture(u32),
+    Goal(u32),
+}
+
+/// A node with a queue of one picture: the newest replaces what waits.
+#[derive(Default)]
+struct Node {
+    takes: u64,
+    is_silent: bool,
+    waiting: Option<u32>,
+    working: Option<(u32, u64)>,
+    goals: BTreeSet<u32>,
+}
+
+impl Node {
+    fn given(&mut self, sent: Sent) {
+        match sent {
+            Sent::Picture(number) => self.waiting = Some(number),
+            Sent::Goal(number) => drop(self.goals.insert(number)),
+        }
+    }
+
+    /// What it has answered at this millisecond.
+    fn works(&mut self, t: u64) -> Option<u32> {
+        let done = self.working.take_if(|(_, until)| *until <= t);
+        if self.working.is_none() {
+            self.working = self.waiting.take().map(|number| (number, t + self.takes));
+        }
+        done.filter(|_| !self.is_silent).map(|(number, _)| number)
+    }
+
+    fn ends(&mut self) {
+        (self.waiting, self.working) = (None, None);
+        self.goals.clear();
+    }
+}
+
+struct World {
+    governor: Governor<Sent>,
+    begin: Instant,
+    t: u64,
+    is_by_stamp: bool,
+    period: u64,
+    /// The way to the cloud and back, milliseconds each.
+    delay: u64,
+    /// Each so many pictures one is lost on the way; zero: none.
+    loses: u32,
+    has_link: bool,
+    nodes: [Node; 2],
+    up: VecDeque<(u64, Sent)>,
+    down: VecDeque<(u64, u32)>,
+    /// When the local original will be up, and whether it is.
+    local_up: Option<u64>,
+    is_local_up: bool,
+    pictures: u32,
+    /// By stamp: how many answers of each side were delivered.
+    delivered: BTreeMap<u32, [u32; 2]>,
+    speakers: BTreeMap<u32, Side>,
+    results: BTreeMap<u32, u32>,
+    stops: Vec<u64>,
+    /// When anybody answered a picture.
+    heard: Vec<u64>,
+    /// The camera runs.
+    films: bool,
+}
+
+impl World {
+    fn new(local: &str, by: &str) -> Self {
+        let sla = serde_json::json!({
+            "t_desire": 0.1, "t_max": 0.3, "local": local, "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}
+        });
+        let begin = Instant::now();
+        let mut governor = Governor::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        governor.link_up(begin, false);
+        governor.begin(begin);
+        let node = || Node {
+            takes: 64,
+            ..Node::default()
+        };
+        let mut world = Self {
+            governor,
+            begin,
+            t: 0,
+            is_by_stamp: by == "stamp",
+            period: 33,
+            delay: 0,
+            loses: 0,
+            has_link: true,
+            nodes: [node(), node()],
+            up: VecDeque::new(),
+            down: VecDeque::new(),
+            local_up: None,
+            is_local_up: false,
+            pictures: 0,
+            delivered: BTreeMap::new(),
+            speakers: BTreeMap::new(),
+            results: BTreeMap::new(),
+            stops: Vec::new(),
+            heard: Vec::new(),
+            films: true,
+        };
+        world.obey();
+        world
+    }
+
+    fn with_pairs(local: &str, by: &str) -> Self {
+        let mut world = Self::new(local, by);
+        world.learns_actions();
+        world.learns_pictures();
+        world
+    }
+
+    fn learns_pictures(&mut self) {
+        let by = if self.is_by_stamp { "stamp" } else { "arrival" };
+        let pair = format!("/image -> /found by {by}").parse().unwrap();
+        self.governor.learn(self.now(), vec![pair]);
+    }
+
+    fn learns_actions(&mut self) {
+        let pair = "/walk/goal -> /walk/result, /walk/feedback by goal";
+        self.governor.learn(self.now(), vec![pair.parse().unwrap()]);
+    }
+
+    fn now(&self) -> Instant {
+        self.begin + MS * self.t as u32
+    }
+
+    fn counts(&self) -> Counts {
+        self.governor.report(self.now()).counts
+    }
+
+    fn passes(&mut self, ms: u64) {
+        for _ in 0..ms {
+            self.t += 1;
+            self.step();
+        }
+    }
+
+    fn step(&mut self) {
+        if self.local_up.take_if(|at| *at <= self.t).is_some() {
+            self.is_local_up = true;
+            self.governor.local(self.now(), LocalState::Ready);
+            self.obey();
+        }
+        if self.films && self.t % self.period == 0 {
+            self.publishes();
+        }
+        while let Some(sent) = arrived(&mut self.up, self.t, self.has_link) {
+            self.nodes[0].given(sent);
+        }
+        if let Some(number) = self.nodes[0].works(self.t) {
+            self.down.push_back((self.t + self.delay, number));
+        }
+        while let Some(number) = arrived(&mut self.down, self.t, self.has_link) {
+            self.answers(Side::Cloud, number);
+        }
+        if let Some(number) = self.nodes[1].works(self.t).filter(|_| self.is_local_up) {
+            self.answers(Side::Local, number);
+        }
+        if self.t % FEEDBACK == 0 {
+            self.feeds_back();
+        }
+        while self.governor.deadline().is_some_and(|at| at <= self.now()) {
+            self.governor.tick(self.now());
+        }
+        self.obey();
+    }
+
+    fn publishes(&mut self) {
+        self.pictures += 1;
+        let topic: Arc<str> = "/image".into();
+        let key = self.is_by_stamp.then_some(Key::Stamp(Stamp {
+            secs: self.pictures,
+            nsecs: 0,
+        }));
+        self.governor
+            .input(self.now(), &topic, key, Sent::Picture(self.pictures));
+        self.obey();
+    }
+
+    fn sends_goal(&mut self, number: u32) {
+        let topic: Arc<str> = "/walk/goal".into();
+        self.governor
+            .input(self.now(), &topic, Some(goal(number)), Sent::Goal(number));
+        self.obey();
+    }
+
+    fn answers(&mut self, side: Side, number: u32) {
+        self.heard.push(self.t);
+        let key = self.is_by_stamp.then_some(Key::Stamp(Stamp {
+            secs: number,
+            nsecs: 0,
+        }));
+        if self
+            .governor
+            .output(self.now(), side, "/found", key, Duration::ZERO)
+            == Verdict::Deliver
+        {
+            self.delivered.entry(number).or_default()[side.index()] += 1;
+        }
+        self.obey();
+    }
+
+    fn is_there(&self, side: Side) -> bool {
+        let sides = self.governor.sides();
+        [sides.cloud, sides.local][side.index()]
+    }
+
+    fn feeds_back(&mut self) {
+        for side in [Side::Cloud, Side::Local] {
+            let can_speak = [self.has_link, self.is_local_up][side.index()];
+            if self.nodes[side.index()].is_silent || !can_speak {
+                continue;
+            }
+            for number in self.nodes[side.index()].goals.clone() {
+                let earlier = self.speakers.get(&number).copied();
+                let earlier = earlier.filter(|earlier| self.is_there(*earlier));
+                let may_speak = self.is_there(side) || self.governor.sides() == Sides::default();
+                let is_heard = may_speak && earlier.is_none_or(|earlier| earlier == side);
+                let is_told = self.says(side, "/walk/feedback", number);
+                assert_eq!(
+                    is_told, is_heard,
+                    "goal {number}, {side:?} after {earlier:?}"
+                );
+                if is_heard {
+                    self.speakers.insert(number, side);
+                }
+            }
+        }
+    }
+
+    /// A side says something of a goal. True where that is delivered.
+    fn says(&mut self, side: Side, topic: &str, number: u32) -> bool {
+        let key = Some(goal(number));
+        let verdict = self
+            .governor
+            .output(self.now(), side, topic, key, Duration::ZERO);
+        self.obey();
+        verdict == Verdict::Deliver
+    }
+
+    fn ends_goal(&mut self, side: Side, number: u32) {
+        if self.nodes[side.index()].goals.remove(&number) && self.is_there(side) {
+            let is_told = self.says(side, "/walk/result", number);
+            *self.results.entry(number).or_default() += u32::from(is_told);
+        }
+    }
+
+    fn obey(&mut self) {
+        while let Some(effect) = self.governor.next_effect() {
+            match effect {
+                Effect::Give {
+                    side,
+                    payload,
+                    channel: Channel::Topic(_),
+                    ..
+                } => match side {
+                    Side::Cloud => {
+                        let is_lost = matches!(payload, Sent::Picture(number) if self.loses > 0 && number % self.loses == 0);
+                        if !is_lost {
+                            self.up.push_back((self.t + self.delay, payload));
+                        }
+                    }
+                    Side::Local => self.nodes[1].given(payload),
+                },
+                Effect::Event(Event::Start(_)) => self.local_up = Some(self.t + STARTS),
+                Effect::Event(Event::Stop(_)) => self.local_ends(),
+                Effect::SafeStop => self.stops.push(self.t),
+                _ => {}
+            }
+        }
+    }
+
+    fn local_ends(&mut self) {
+        (self.local_up, self.is_local_up) = (None, false);
+        self.nodes[1].ends();
+    }
+
+    fn cut(&mut self) {
+        self.has_link = false;
+        self.governor.link_down(self.now());
+        self.obey();
+    }
+
+    fn restore(&mut self, resumed: bool) {
+        self.has_link = true;
+        if !resumed {
+            self.up.clear();
+            self.down.clear();
+            self.nodes[0].ends();
+        }
+        self.governor.link_up(self.now(), resumed);
+        self.obey();
+    }
+}
+
+/// The first of these that is there at `t`, on a way that is open.
+fn arrived<T>(way: &mut VecDeque<(u64, T)>, t: u64, is_open: bool) -> Option<T> {
+    let (at, _) = way.front()?;
+    if !is_open || *at > t {
+        return None;
+    }
+    way.pop_front().map(|(_, sent)| sent)
+}
+
+fn goal(number: u32) -> Key {
+    Key::Goal(format!("goal {number}").into())
+}
+
+#[test]
+fn a_node_that_takes_64_ms_of_a_30_hz_camera_keeps_its_promise_by_the_cloud() {
+    for (by, delay) in [("stamp", 0), ("stamp", 90), ("arrival", 0), ("arrival", 90)] {
+        let mut world = World::with_pairs("none", by);
+        world.delay = delay;
+        world.passes(10_000);
+        let counts = world.counts();
+        println!("{by}, {delay} ms each way: {counts:?}");
+        assert_eq!(
+            (counts.late, counts.safe_stops),
+            (0, 0),
+            "{by}, {delay}: {counts:?}"
+        );
+        assert!(
+            counts.desired + counts.accepted > 100,
+            "{by}, {delay}: {counts:?}"
+        );
+    }
+}
+
+#[test]
+fn offline_a_warm_original_that_answers_in_time_stops_nobody() {
+    for (by, period, takes) in [
+        ("arrival", 50, 40),
+        ("arrival", 33, 64),
+        ("stamp", 50, 40),
+        ("stamp", 33, 64),
+    ] {
+        let mut world = World::with_pairs("warm", by);
+        world.period = period;
+        world.nodes[1].takes = takes;
+        world.passes(3000);
+        world.cut();
+        // Q has to see two requests late: by arrival one after the other.
+        world.passes(3 * T_MAX);
+        let begun = world.stops.len();
+        world.passes(10_000);
+        let counts = world.counts();
+        println!("{by}, {period} ms: {begun} stops until the hand-over; {counts:?}");
+        assert_eq!(world.stops.len(), begun, "{by}, {period}: {counts:?}");
+        world.restore(true);
+        world.passes(3000);
+        assert_eq!(world.stops.len(), begun, "{by}, {period}: {counts:?}");
+    }
+}
+
+#[test]
+fn who_takes_every_picture_and_falls_silent_is_stopped_for_at_t_max() {
+    let mut world = World::with_pairs("none", "stamp");
+    (world.delay, world.nodes[0].takes) = (50, 10);
+    world.passes(10_000);
+    assert_eq!(world.counts().safe_stops, 0);
+    world.nodes[0].is_silent = true;
+    world.passes(1000);
+    // Answers that were on their way came yet.
+    let answered = *world.delivered.keys().last().unwrap();
+    let due = u64::from(answered + 1) * world.period + T_MAX + 1;
+    assert_eq!(world.stops[0], due, "after picture {answered}");
+}
+
+#[test]
+fn a_node_that_becomes_slow_is_late_once_at_most() {
+    for takes in [40, 64, 100, 130] {
+        let mut world = World::with_pairs("none", "stamp");
+        (world.delay, world.nodes[0].takes) = (20, 10);
+        world.passes(10_000);
+        assert_eq!(world.counts().left_out, 0);
+        world.nodes[0].takes = takes;
+        world.passes(10_000);
+        let counts = world.counts();
+        println!("{takes} ms: {counts:?}");
+        let is_calm = counts.late <= 1 && counts.safe_stops <= 1;
+        assert!(is_calm && counts.left_out > 10, "{takes} ms: {counts:?}");
+    }
+}
+
+#[test]
+fn feedback_goes_on_after_a_hand_over_and_a_long_goal_stops_nobody() {
+    let mut world = World::with_pairs("warm", "arrival");
+    world.sends_goal(1);
+    world.passes(60_000);
+    assert_eq!(world.speakers[&1], Side::Cloud);
+    let counts = world.counts();
+    let trouble = (counts.late, counts.safe_stops, counts.failed);
+    assert_eq!(trouble, (1, 0, 0), "{counts:?}");
+    world.cut();
+    world.passes(2000);
+    assert_eq!(world.speakers[&1], Side::Local, "it was given the goal");
+    world.restore(true);
+    world.passes(5000);
+    assert_eq!(world.speakers[&1], Side::Cloud);
+    world.passes(300_000);
+    world.ends_goal(Side::Cloud, 1);
+    world.ends_goal(Side::Local, 1);
+    assert_eq!(world.results[&1], 1);
+}
+
+/// A time in which nothing changes.
+#[derive(Debug, Clone)]
+struct Times {
+    length: u64,
+    link: Link,
+    is_silent: bool,
+    delay: u64,
+    takes: [u64; 2],
+    loses: u32,
+    crashes: bool,
+    sends_goal: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Link {
+    Up,
+    Renewed,
+    Cut,
+}
+
+fn times() -> impl Strategy<Value = Times> {
+    let link = prop_oneof![6 => Just(Link::Up), 1 => Just(Link::Renewed), 2 => Just(Link::Cut)];
+    let takes = || prop_oneof![5u64..30, 30u64..130];
+    let loses = prop_oneof![3 => Just(0u32), 1 => 2u32..12];
+    let chances = [6.0, 8.0, 4.0].map(|one_of| prop::bool::weighted(1.0 / one_of));
+    let numbers = (300u64..2500, 0u64..150, [takes(), takes()], loses);
+    (numbers, link, chances).prop_map(|((length, delay, takes, loses), link, chances)| {
+        let [is_silent, crashes, sends_goal] = chances;
+        Times {
+            length,
+            link,
+            is_silent,
+            delay,
+            takes,
+            loses,
+            crashes,
+            sends_goal,
+        }
+    })
+}
+
+impl Times {
+    /// All is well, and nobody films any more.
+    const END: Self = Self {
+        length: 0,
+        link: Link::Up,
+        is_silent: false,
+        delay: 0,
+        takes: [10; 2],
+        loses: 0,
+        crashes: false,
+        sends_goal: false,
+    };
+
+    /// Whether what a side takes is answered within T_max, considering what is left out and lost.
+    fn suffices(&self, period: u64, side: Side) -> bool {
+        let takes = 2 * self.takes[side.index()] + period;
+        if side == Side::Local {
+            return takes <= T_MAX;
+        }
+        let is_there = self.link != Link::Cut && !self.is_silent;
+        let lost = if self.loses > 0 { 2 * period } else { 0 };
+        is_there && 2 * self.delay + takes + lost <= T_MAX
+    }
+}
+
+impl World {
+    fn begins(&mut self, times: &Times) {
+        match times.link {
+            Link::Cut if self.has_link => self.cut(),
+            Link::Up if !self.has_link => self.restore(true),
+            Link::Renewed => {
+                self.cut();
+                self.restore(false);
+            }
+            _ => {}
+        }
+        self.nodes[0].is_silent = times.is_silent;
+        (self.delay, self.loses) = (times.delay, times.loses);
+        for side in 0..2 {
+            self.nodes[side].takes = times.takes[side];
+        }
+        if times.crashes && self.is_local_up {
+            self.local_ends();
+            self.local_up = Some(self.t + STARTS);
+            self.governor.local_crashed(self.now(), "signal 11");
+            self.obey();
+        }
+    }
+
+    /// Lets a time pass, and looks for safe stops while somebody answers.
+    fn lives_through(&mut self, times: &Times) -> Result<(), TestCaseError> {
+        self.begins(times);
+        let (settled, ends) = (self.t + 2 * T_MAX, self.t + times.length);
+        let mut is_stood_in_for = times.suffices(self.period, Side::Local);
+        while self.t < ends {
+            self.passes(1);
+            is_stood_in_for &= self.is_there(Side::Local);
+        }
+        let answers = is_stood_in_for || times.suffices(self.period, Side::Cloud);
+        let mut stops = self.stops.iter().filter(|at| **at > settled);
+        let stop = stops.next().filter(|_| answers);
+        prop_assert!(stop.is_none(), "{:?} in {:?}, until {}", stop, times, ends);
+        Ok(())
+    }
+
+    /// Whoever is silent is stopped for.
+    fn was_stopped(&self, since: u64) -> Result<(), TestCaseError> {
+        let t_max = if self.is_by_stamp { T_MAX } else { 2 * T_MAX };
+        let patience = t_max + 3 * self.period;
+        let heard = self.heard.iter().copied().filter(|at| *at > since);
+        let mut from = since;
+        for until in heard.chain([self.t]) {
+            let mut stops = self.stops.iter();
+            let stopped = stops.any(|at| (from..=from + patience).contains(at));
+            let is_short = until - from <= patience;
+            prop_assert!(is_short || stopped, "silence from {} to {}", from, until);
+            from = until;
+        }
+        Ok(())
+    }
+}
+
+/// `known`: before which of the times the pairs of the action and of the pictures become known.
+fn live(world: &mut World, all: &[Times], known: [usize; 2]) -> Result<(), TestCaseError> {
+    let (mut goals, mut since) = (0, None);
+    for (index, times) in all.iter().enumerate() {
+        if index == known[0] {
+            world.learns_actions();
+        }
+        if index == known[1] {
+            since = Some(world.t);
+            world.learns_pictures();
+        }
+        if times.sends_goal && index >= known[0] {
+            goals += 1;
+            world.sends_goal(goals);
+        }
+        world.lives_through(times)?;
+    }
+    if let Some(since) = since {
+        world.was_stopped(since)?;
+    }
+    world.begins(&Times::END);
+    world.films = false;
+    world.passes(2000);
+    for number in 1..=goals {
+        world.ends_goal(Side::Cloud, number);
+        world.ends_goal(Side::Local, number);
+        prop_assert_eq!(world.results.get(&number), Some(&1), "goal {}", number);
+    }
+    world.passes(2 * T_MAX);
+    if world.is_by_stamp && since == Some(0) {
+        let mut answered = world.delivered.iter();
+        let twice = answered.find(|(_, by)| by[0] + by[1] > 1);
+        prop_assert!(twice.is_none(), "answered twice: {:?}", twice);
+    }
+    let counts = world.counts();
+    let counted = counts.desired + counts.accepted + counts.late + counts.left_out;
+    prop_assert_eq!(counted, counts.requests, "{:?}", counts);
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(200) })]
+    #[test]
+    fn whatever_happens(
+        all in prop::collection::vec(times(), 1..10),
+        local in prop_oneof![Just("cold"), Just("warm"), Just("none")],
+        by in prop_oneof![Just("stamp"), Just("arrival")],
+        period in prop_oneof![Just(33u64), Just(50), Just(200)],
+        known in prop_oneof![Just([0, 0]), Just([0, 1]), Just([1, 0]), Just([2, 1])],
+    ) {
+        let mut world = World::new(local, by);
+        world.period = period;
+        live(&mut world, &all, known)?;
+    }
+}
