@@ -206,6 +206,7 @@ impl Link<'_> {
                 ahead,
                 next,
                 codecs,
+                limits,
                 servant,
             } => {
                 if !resumed && self.session.is_some() {
@@ -225,6 +226,7 @@ impl Link<'_> {
                     tracing::warn!("{unmet}");
                 }
                 self.unmet = unmet;
+                session.peer_takes(limits);
                 session.reconnect(received, &ahead, next);
                 Ok(())
             }

@@ -112,10 +112,11 @@ impl Inputs {
                 &message.wire_type,
             )
         };
-        // Goals and what cancels them are no stream of which the newest would do.
+        // Goals and what cancels them are no stream of which the newest would do, and no goal may come after what cancels it.
         let of = &message.wire_type.name;
-        let of_action = actions::carries_goal_id(of) || actions::commands(of);
-        let quality = if message.latching || of_action {
+        let quality = if actions::commands(of) {
+            Quality::InOrder
+        } else if message.latching || actions::carries_goal_id(of) {
             Quality::Each
         } else {
             Quality::Newest
