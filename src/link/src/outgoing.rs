@@ -26,6 +26,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use ::budget::{Budget, Permit};
 use ros::ring::{Held, Ring};
+use ros::ros1::actions;
 use ros::turns::Turns;
 
 use crate::drops::{Cause, Tally};
@@ -65,6 +66,19 @@ pub enum Quality {
     /// Every one counts, and none comes before another one of any topic that was sent before it (goals, and what cancels them), nor before a
     /// call.
     InOrder,
+}
+
+impl Quality {
+    /// How a message of this type is treated: goals, what cancels them, and what comes of them are no stream of which the newest would do.
+    pub fn of(type_name: &str, is_latching: bool) -> Self {
+        if actions::commands(type_name) {
+            Self::InOrder
+        } else if is_latching || actions::carries_goal_id(type_name) {
+            Self::Each
+        } else {
+            Self::Newest
+        }
+    }
 }
 
 #[derive(Debug)]

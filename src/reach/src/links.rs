@@ -282,13 +282,16 @@ impl Hub {
         );
         let lost = {
             let mut running = pin!(link.session.run(&mut socket, &*link));
-            tokio::select! {
-                lost = &mut running => lost,
-                _ = kicked.wait_for(|kicks| *kicks != turn) => match self.check_open() {
-                    // The robot is told why.
-                    Err(_) => running.await,
-                    Ok(()) => return replaced_by_another(),
-                },
+            let replaced = async { kicked.wait_for(|kicks| *kicks != turn).await.is_ok() };
+            let lost = tokio::select! {
+                lost = &mut running => Some(lost),
+                _ = replaced => None,
+            };
+            match (lost, self.check_open()) {
+                (Some(lost), _) => lost,
+                // The robot is told why.
+                (None, Err(_)) => running.await,
+                (None, Ok(())) => return replaced_by_another(),
             }
         };
         carrying.is_ended = matches!(

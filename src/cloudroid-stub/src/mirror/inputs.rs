@@ -11,7 +11,6 @@ use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use ros::bus::{Digest, Matched, Message, Peer, PeerId, Qos, WireType};
-use ros::ros1::actions;
 use tokio::task::AbortHandle;
 
 use super::Mirror;
@@ -112,15 +111,7 @@ impl Inputs {
                 &message.wire_type,
             )
         };
-        // Goals and what cancels them are no stream of which the newest would do, and no goal may come after what cancels it.
-        let of = &message.wire_type.name;
-        let quality = if actions::commands(of) {
-            Quality::InOrder
-        } else if message.latching || actions::carries_goal_id(of) {
-            Quality::Each
-        } else {
-            Quality::Newest
-        };
+        let quality = Quality::of(&message.wire_type.name, message.latching);
         let data = Data {
             channel,
             encoded: false,

@@ -503,6 +503,25 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
 }
 
 #[test]
+fn goals_and_what_cancels_them_come_in_order_and_results_all() {
+    for (of, quality) in [
+        ("move_base_msgs/MoveBaseActionGoal", Quality::InOrder),
+        ("actionlib_msgs/GoalID", Quality::InOrder),
+        ("move_base_msgs/MoveBaseActionResult", Quality::Each),
+        ("sensor_msgs/Image", Quality::Newest),
+    ] {
+        assert_eq!(Quality::of(of, false), quality, "{of}");
+    }
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    out.push(&data(1, 1, 10 * SMALL), Quality::InOrder);
+    out.push(&data(2, 2, 10), Quality::InOrder);
+    let came: Vec<i64> = std::iter::from_fn(|| out.next(0))
+        .filter_map(|frame| born(deliver(&mut incoming, frame)))
+        .collect();
+    assert_eq!(came, [1, 2], "the goal, and then what cancels it");
+}
+
+#[test]
 fn goals_beyond_the_limit_are_dropped_and_counted() {
     let mut out = Outgoing::new(None);
     for number in 0..CALLS.messages as i64 + 3 {
