@@ -22,23 +22,22 @@ mod lanes;
 mod out;
 mod retransmit;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 
 use ::budget::{Budget, Permit};
 use ros::ring::{Held, Ring};
-use ros::ros1::actions;
 use ros::turns::Turns;
 
 use crate::drops::{Cause, Tally};
 use crate::frame::Frame;
 use crate::limits::Limits;
 use crate::record::{LEFT_AT, Record};
-use data::topic;
 use encoding::Encoding;
 use gate::Gate;
 use lanes::{Lane, Lanes, Lines};
 use out::Out;
-use retransmit::{Retransmit, Sent};
+pub use out::Quality;
+use retransmit::Retransmit;
 
 /// Records up to this size go in one piece, and are kept until the peer has them.
 pub(crate) const SMALL: usize = 32 * 1024;
@@ -55,31 +54,6 @@ const SMALL_IN_A_ROW: u32 = 16;
 const TURN_OF_DATA: u32 = 4;
 /// The part of the numbers that the peer takes ahead of a missing one which is used for what would not be sent again.
 const UNKEPT_AHEAD: usize = 4;
-
-/// How a message may be treated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quality {
-    /// A newer one may take its place.
-    Newest,
-    /// Every one counts (latched messages, results): never dropped for its age.
-    Each,
-    /// Every one counts, and none comes before another one of any topic that was sent before it (goals, and what cancels them), nor before a
-    /// call.
-    InOrder,
-}
-
-impl Quality {
-    /// How a message of this type is treated: goals, what cancels them, and what comes of them are no stream of which the newest would do.
-    pub fn of(type_name: &str, is_latching: bool) -> Self {
-        if actions::commands(type_name) {
-            Self::InOrder
-        } else if is_latching || actions::carries_goal_id(type_name) {
-            Self::Each
-        } else {
-            Self::Newest
-        }
-    }
-}
 
 #[derive(Debug)]
 struct Sending {
@@ -378,35 +352,6 @@ impl Outgoing {
         Some(Frame::More { stream, bytes })
     }
 
-    /// The peer has all numbers up to this one.
-    pub(crate) fn acknowledge(&mut self, number: u64) {
-        let number = number.min(self.next_number - 1);
-        self.acknowledged = self.acknowledged.max(number);
-        while let Some(out) = self.retransmit.acknowledged(number) {
-            self.has_come(&out);
-        }
-        self.count_less();
-    }
-
-    fn has_come(&mut self, out: &Out) {
-        self.lanes.let_go(out);
-        // All that went before it has come, too.
-        if let Some(channel) = out.channel.filter(|_| out.closes) {
-            self.topics.remove(&channel);
-            self.turns.forget(channel);
-            self.openings.remove(&channel);
-            self.encoding.remove(channel);
-            self.closed.push(channel);
-        }
-    }
-
-    fn was_lost(&mut self, channel: Option<u32>) {
-        match channel {
-            Some(channel) => self.dropped.add(channel, Cause::CutOff, 1),
-            None => self.lines.leave_out(1),
-        }
-    }
-
     /// The link carries so many bytes per second.
     pub(crate) fn set_throughput(&mut self, bytes_per_second: f64) {
         let piece = (bytes_per_second * PIECE_TIME) as usize;
@@ -427,49 +372,6 @@ impl Outgoing {
     /// The first number on the next connection.
     pub(crate) fn next_number(&self) -> u64 {
         self.next_number
-    }
-
-    /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
-    /// in order. Big messages that were under way are lost unless each one counts.
-    pub(crate) fn reconnect(&mut self, received: u64, ahead: &[u64]) {
-        for out in self.encoding.give_up() {
-            if let Some(channel) = out.channel {
-                let topic = topic(&mut self.topics, channel);
-                if out.each || topic.is_empty() {
-                    topic.put_back(out);
-                } else {
-                    self.dropped.add(channel, Cause::Replaced, 1);
-                }
-            }
-        }
-        for Sending {
-            number, again, out, ..
-        } in std::mem::take(&mut self.sending)
-        {
-            if number == 0 {
-                self.was_lost(out.channel);
-            }
-            self.retransmit.add(number, again, out);
-        }
-        let ahead: BTreeSet<u64> = ahead.iter().copied().collect();
-        for (number, sent) in std::mem::take(&mut self.retransmit).into_records().rev() {
-            match sent {
-                Sent::Again(out) if number <= received || ahead.contains(&number) => {
-                    self.has_come(&out);
-                }
-                Sent::Again(out) => match (out.lane, out.channel) {
-                    (Lane::Lines, _) => self.lines.put_back(out),
-                    (Lane::Data, Some(channel)) => topic(&mut self.topics, channel).put_back(out),
-                    _ => self.lanes.put_back(out),
-                },
-                Sent::Once(_) if number <= received || ahead.contains(&number) => {}
-                Sent::Once(channel) => self.was_lost(channel),
-            }
-        }
-        self.acknowledged = self.next_number - 1;
-        self.turns = Turns::default();
-        let waiting = self.topics.iter().filter(|(_, topic)| !topic.is_empty());
-        waiting.for_each(|(channel, _)| self.turns.join(*channel));
     }
 }
 

@@ -2,10 +2,36 @@
 
 use bytes::{BufMut, Bytes, BytesMut};
 use ros::ring::Held;
+use ros::ros1::actions;
 
 use super::SMALL;
 use super::lanes::Lane;
 use crate::record::Record;
+
+/// How a message may be treated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quality {
+    /// A newer one may take its place.
+    Newest,
+    /// Every one counts (latched messages, results): never dropped for its age.
+    Each,
+    /// Every one counts, and none comes before another one of any topic that was sent before it (goals, and what cancels them), nor before a
+    /// call.
+    InOrder,
+}
+
+impl Quality {
+    /// How a message of this type is treated: goals, what cancels them, and what comes of them are no stream of which the newest would do.
+    pub fn of(type_name: &str, is_latching: bool) -> Self {
+        if actions::commands(type_name) {
+            Self::InOrder
+        } else if is_latching || actions::carries_goal_id(type_name) {
+            Self::Each
+        } else {
+            Self::Newest
+        }
+    }
+}
 
 #[derive(Debug, Clone)]
 pub(crate) struct Out {

@@ -1,12 +1,15 @@
 //! The retransmit buffer: what the peer was sent and has not said to have.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use ros::ring::Held;
+use ros::turns::Turns;
 
-use super::budget;
+use super::data::topic;
 use super::lanes::Lane;
 use super::out::Out;
+use super::{Outgoing, Sending, budget};
+use crate::drops::Cause;
 use crate::limits::KEPT;
 use crate::record::{ENCODED, FLAGS_AT};
 
@@ -118,5 +121,79 @@ impl Retransmit {
     /// All records, by number.
     pub(super) fn into_records(self) -> impl DoubleEndedIterator<Item = (u64, Sent)> {
         self.records.into_iter()
+    }
+}
+
+impl Outgoing {
+    /// The peer has all numbers up to this one.
+    pub(crate) fn acknowledge(&mut self, number: u64) {
+        let number = number.min(self.next_number - 1);
+        self.acknowledged = self.acknowledged.max(number);
+        while let Some(out) = self.retransmit.acknowledged(number) {
+            self.has_come(&out);
+        }
+        self.count_less();
+    }
+
+    fn has_come(&mut self, out: &Out) {
+        self.lanes.let_go(out);
+        // All that went before it has come, too.
+        if let Some(channel) = out.channel.filter(|_| out.closes) {
+            self.topics.remove(&channel);
+            self.turns.forget(channel);
+            self.openings.remove(&channel);
+            self.encoding.remove(channel);
+            self.closed.push(channel);
+        }
+    }
+
+    fn was_lost(&mut self, channel: Option<u32>) {
+        match channel {
+            Some(channel) => self.dropped.add(channel, Cause::CutOff, 1),
+            None => self.lines.leave_out(1),
+        }
+    }
+
+    /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
+    /// in order. Big messages that were under way are lost unless each one counts.
+    pub(crate) fn reconnect(&mut self, received: u64, ahead: &[u64]) {
+        for out in self.encoding.give_up() {
+            if let Some(channel) = out.channel {
+                let topic = topic(&mut self.topics, channel);
+                if out.each || topic.is_empty() {
+                    topic.put_back(out);
+                } else {
+                    self.dropped.add(channel, Cause::Replaced, 1);
+                }
+            }
+        }
+        for Sending {
+            number, again, out, ..
+        } in std::mem::take(&mut self.sending)
+        {
+            if number == 0 {
+                self.was_lost(out.channel);
+            }
+            self.retransmit.add(number, again, out);
+        }
+        let ahead: BTreeSet<u64> = ahead.iter().copied().collect();
+        for (number, sent) in std::mem::take(&mut self.retransmit).into_records().rev() {
+            match sent {
+                Sent::Again(out) if number <= received || ahead.contains(&number) => {
+                    self.has_come(&out);
+                }
+                Sent::Again(out) => match (out.lane, out.channel) {
+                    (Lane::Lines, _) => self.lines.put_back(out),
+                    (Lane::Data, Some(channel)) => topic(&mut self.topics, channel).put_back(out),
+                    _ => self.lanes.put_back(out),
+                },
+                Sent::Once(_) if number <= received || ahead.contains(&number) => {}
+                Sent::Once(channel) => self.was_lost(channel),
+            }
+        }
+        self.acknowledged = self.next_number - 1;
+        self.turns = Turns::default();
+        let waiting = self.topics.iter().filter(|(_, topic)| !topic.is_empty());
+        waiting.for_each(|(channel, _)| self.turns.join(*channel));
     }
 }
