@@ -23,8 +23,9 @@ const MAX_HEAD: usize = 64 * 1024;
 /// For a frame of the server to come as a whole, once it has begun.
 const UNFINISHED: Duration = Duration::from_secs(300);
 const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
-/// Unsent bytes that the kernel may hold: what waits in it cannot be replaced by something newer.
-const UNSENT: u32 = 64 * 1024;
+/// Unsent bytes that the kernel may hold: what waits in it cannot be replaced by something newer, and a command waits for it. At 500 kbit/s they
+/// are a quarter of a second.
+const UNSENT: u32 = 16 * 1024;
 
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]

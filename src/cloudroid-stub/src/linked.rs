@@ -252,6 +252,7 @@ impl Link<'_> {
                 ahead,
                 next,
                 codecs,
+                limits,
                 servant,
             } => {
                 if !resumed && self.session.is_some() {
@@ -272,6 +273,7 @@ impl Link<'_> {
                     tracing::warn!("{unmet}");
                 }
                 self.unmet = unmet;
+                session.peer_takes(limits);
                 session.reconnect(received, &ahead, next);
                 Ok(())
             }

@@ -10,7 +10,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::drops::Drop;
-use crate::{MAX_CONTROL, MAX_FRAME, bounded};
+use crate::{Limits, MAX_CONTROL, MAX_FRAME, bounded};
 
 /// The robot's first frame on every connection.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -48,6 +48,8 @@ pub struct Hello {
     pub keep_stamps: bool,
     /// The robot answers a `Lookup`.
     pub lends: bool,
+    /// What the robot takes of the cloud; absent: what all earlier releases take.
+    pub limits: Limits,
     /// All parameters of the robot, as a tree of values.
     #[serde(with = "crate::values::tree")]
     pub parameters: BTreeMap<String, ParamValue>,
@@ -162,6 +164,9 @@ pub enum Welcome {
         /// Codecs that the cloud decodes.
         #[serde(default, deserialize_with = "bounded::list::<_, _, 256>")]
         codecs: Vec<String>,
+        /// What the cloud takes of the robot; absent: what all earlier releases take.
+        #[serde(default)]
+        limits: Limits,
         /// The servant, for logs.
         servant: String,
     },
@@ -306,6 +311,11 @@ impl<O: DeserializeOwned> Control<O> {
 pub trait Order: Serialize + DeserializeOwned + Send + Sync + 'static {
     /// Those that the other end gives.
     type OfPeer: Order;
+
+    /// Whether it may be left out where the link does not carry all.
+    fn is_line(&self) -> bool {
+        false
+    }
 }
 
 impl Order for FromRobot {
@@ -314,6 +324,10 @@ impl Order for FromRobot {
 
 impl Order for FromCloud {
     type OfPeer = FromRobot;
+
+    fn is_line(&self) -> bool {
+        matches!(self, Self::Line { .. })
+    }
 }
 
 /// A decision about the local original.
@@ -556,12 +570,25 @@ mod tests {
         let hello: Hello = serde_json::from_str(hello).unwrap();
         assert_eq!((hello.run.as_str(), hello.machine.as_str()), ("r", "m"));
         assert_eq!((hello.next, hello.attempt), (5, 0));
+        let earlier = Limits {
+            record: 256 << 20,
+            under_way: 256,
+            under_way_bytes: 320 << 20,
+            ahead: 65_536,
+        };
+        assert_eq!(hello.limits, earlier, "what earlier releases take");
         assert_eq!(hello.resume.unwrap().ahead, [6]);
         assert_eq!((hello.node.name.as_str(), hello.sla.max), ("/n", Some(0.3)));
         assert!(!hello.node.named_by_argv);
         let welcome = r#"{"accepted":{"session":"s","resumed":true,"received":1,"ahead":[],"next":2,"servant":"v"}}"#;
         let welcome: Welcome = serde_json::from_str(welcome).unwrap();
-        assert!(matches!(welcome, Welcome::Accepted { next: 2, .. }));
+        let Welcome::Accepted {
+            next: 2, limits, ..
+        } = welcome
+        else {
+            panic!("{welcome:?}");
+        };
+        assert_eq!(limits, earlier);
         let refused = r#"{"refused":{"reason":"why","again":true}}"#;
         let refused: Welcome = serde_json::from_str(refused).unwrap();
         assert!(matches!(refused, Welcome::Refused { again: true, .. }));

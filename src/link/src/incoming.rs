@@ -7,14 +7,8 @@ use bytes::{Bytes, BytesMut};
 
 use crate::frame::Received;
 use crate::record::is_control;
-use crate::{Error, MAX_FRAME, MAX_RECORD};
+use crate::{Error, Limits, MAX_FRAME};
 
-/// Records under way at once.
-const MAX_STREAMS: usize = 256;
-/// Bytes of records under way.
-const MAX_PARTIAL: usize = MAX_RECORD + (64 << 20);
-/// Numbers that came before one still missing.
-const MAX_AHEAD: usize = 65_536;
 /// Bytes allocated for a record before its bytes arrive; the buffer doubles as they do.
 const READ_AHEAD: usize = 1 << 20;
 
@@ -30,6 +24,7 @@ pub(crate) struct Incoming {
     bytes: u64,
     streams: HashMap<u32, Partial>,
     partial: usize,
+    pub(crate) limits: Limits,
 }
 
 #[derive(Debug)]
@@ -57,6 +52,7 @@ impl Incoming {
             bytes: 0,
             streams: HashMap::new(),
             partial: 0,
+            limits: Limits::default(),
         }
     }
 
@@ -70,6 +66,12 @@ impl Incoming {
             number: self.number,
             bytes: self.bytes,
         }
+    }
+
+    /// How many records are under way, and their bytes together.
+    #[cfg(test)]
+    pub(crate) fn under_way(&self) -> (usize, usize) {
+        (self.streams.len(), self.partial)
     }
 
     /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again: the peer
@@ -96,25 +98,24 @@ impl Incoming {
         bytes: &[u8],
     ) -> Result<Option<Bytes>, Error> {
         let total = total as usize;
-        if total > MAX_RECORD {
-            return Err(too_much("a record", total, MAX_RECORD));
+        let limits = self.limits;
+        if total > limits.record {
+            return Err(too_much("a record", total, limits.record));
         }
         if is_control(bytes) && total > MAX_FRAME {
             return Err(too_much("a control record", total, MAX_FRAME));
         }
-        if self.streams.len() >= MAX_STREAMS {
-            return Err(too_much(
-                "records under way",
-                self.streams.len(),
-                MAX_STREAMS,
-            ));
+        let under_way = self.streams.len();
+        if under_way >= limits.under_way {
+            return Err(too_much("records under way", under_way, limits.under_way));
         }
         if bytes.len() > total || self.streams.contains_key(&stream) {
             return Err(Error::Protocol("a record that begins twice or is too long"));
         }
         self.partial += total;
-        if self.partial > MAX_PARTIAL {
-            return Err(too_much("records under way", self.partial, MAX_PARTIAL));
+        if self.partial > limits.under_way_bytes {
+            let limit = limits.under_way_bytes;
+            return Err(too_much("records under way", self.partial, limit));
         }
         let partial = Partial {
             number,
@@ -173,8 +174,12 @@ impl Incoming {
             }
             return Ok(true);
         }
-        if self.ahead.len() >= MAX_AHEAD {
-            return Err(too_much("numbers ahead", self.ahead.len(), MAX_AHEAD));
+        if self.ahead.len() >= self.limits.ahead {
+            return Err(too_much(
+                "numbers ahead",
+                self.ahead.len(),
+                self.limits.ahead,
+            ));
         }
         self.ahead.insert(number);
         Ok(true)

@@ -2,7 +2,7 @@
 //! share it.
 //!
 //! ```text
-//!  records ─▶ Outgoing: urgent first, small before big, newest wins ─▶ frames ─▶ WebSocket
+//!  records ─▶ Outgoing: control · calls and goals · answers · data · lines ─▶ frames ─▶ WebSocket
 //!  WebSocket ─▶ frames ─▶ Incoming: pieces put together, doubles dropped ─▶ records
 //! ```
 //!
@@ -27,6 +27,9 @@ pub mod drops;
 mod echoes;
 pub mod frame;
 mod incoming;
+mod limits;
+#[cfg(test)]
+mod model;
 mod outgoing;
 pub mod packing;
 pub mod record;
@@ -36,6 +39,7 @@ mod values;
 
 pub use drops::Dropped;
 pub use echoes::Echoes;
+pub use limits::{Limits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 pub use outgoing::Quality;
 pub use session::{CloudSession, Handler, Lost, RobotSession, Session, SessionOptions};
 
@@ -54,15 +58,6 @@ pub use session::{CloudSession, Handler, Lost, RobotSession, Session, SessionOpt
 pub const SUBPROTOCOL: &str = "cloudroid-link.v2";
 /// What all versions begin with.
 pub const SUBPROTOCOLS: &str = "cloudroid-link.";
-/// The longest WebSocket frame: a piece, or a hello with all of a robot's parameters.
-pub const MAX_FRAME: usize = 32 << 20;
-/// The longest record.
-pub const MAX_RECORD: usize = 256 << 20;
-/// The longest control record but those of parameters, which may be as long as a frame; and the longest hello, without its parameters.
-pub const MAX_CONTROL: usize = 1 << 20;
-/// What control records of one session take in memory at once, at most: those that were read and wait to be obeyed.
-pub const MAX_TOLD: usize = 64 << 20;
-
 /// What can go wrong with a peer.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

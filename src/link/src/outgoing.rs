@@ -2,30 +2,42 @@
 //! its own.
 //!
 //! ```text
-//!  urgent (control, calls, answers) ─┐
-//!  topic 7 ─ small ─ small ──────────┼─▶ next(): urgent, then small ones in turns, then a piece of a big one
-//!  topic 9 ─ big ────────────────────┘        (after SMALL_IN_A_ROW small ones a piece all the same)
+//!  control ───────── in order ─────────────────────┐
+//!  calls and goals ─ in order ─────────────────────┤
+//!  answers ───────── short ones, long ones ────────┼─▶ next(): short records, after SMALL_IN_A_ROW of them a piece of a
+//!  data ──────────── a queue per topic, newest wins┤           long one; lines where nothing waits, and a small share else
+//!  lines ─────────── the oldest give way, counted ─┘
 //! ```
+//! Of control, and of calls and goals, one record is under way at a time, so none overtakes another. A message waits for the opening of its
+//! channel. The sender keeps to the peer's [`Limits`]: what the peer would not take waits here, or is left out and counted.
+//!
 //! Deciding late is the point: the socket is given little at a time, so a newer picture can still replace one that
 //! waits, and a small message never waits for more than a piece.
 
 mod budget;
+mod data;
 mod encoding;
+mod gate;
+mod lanes;
 mod out;
 mod retransmit;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use ::budget::{Budget, Permit};
-use ros::ring::{Bounds, Held, Ring};
+use ros::ring::{Held, Ring};
 use ros::turns::Turns;
 
 use crate::drops::{Cause, Tally};
 use crate::frame::Frame;
+use crate::limits::Limits;
 use crate::record::{LEFT_AT, Record};
 use encoding::Encoding;
+use gate::Gate;
+use lanes::{Lane, Lanes, Lines};
 use out::Out;
-use retransmit::{Retransmit, Sent};
+pub use out::Quality;
+use retransmit::Retransmit;
 
 /// Records up to this size go in one piece, and are kept until the peer has them.
 pub(crate) const SMALL: usize = 32 * 1024;
@@ -33,31 +45,15 @@ pub(crate) const SMALL: usize = 32 * 1024;
 const PIECE_TIME: f64 = 0.008;
 /// The least and the greatest size of a piece, bytes.
 const PIECES: (usize, usize) = (4 * 1024, 64 * 1024);
+/// The socket is given more only when it holds less than this: what is decided later is decided better.
+const LOW_WATER: usize = 24 * 1024;
 /// Before the link was measured.
 const FIRST_PIECE: usize = 32 * 1024;
 const SMALL_IN_A_ROW: u32 = 16;
-/// What waits on one topic; the oldest give way. One always stays.
-const WAITING: Bounds = Bounds {
-    messages: 256,
-    bytes: 2 << 20,
-};
-/// The same once a big message waits: only the newest counts.
-const BIG_WAITING: Bounds = Bounds {
-    messages: 1,
-    ..WAITING
-};
-/// Urgent records that may wait and be kept until the peer has them, and their bytes: beyond, the session is given up. A single
-/// one may have any size.
-const MAX_URGENT: usize = 65_536;
-const MAX_URGENT_BYTES: usize = 512 << 20;
-/// How a message may be treated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quality {
-    /// A newer one may take its place.
-    Newest,
-    /// Every one counts (latched messages, actions): never dropped for its age.
-    Each,
-}
+/// Of so many short records in a row one is a message, if one waits, however many calls and answers do.
+const TURN_OF_DATA: u32 = 4;
+/// The part of the numbers that the peer takes ahead of a missing one which is used for what would not be sent again.
+const UNKEPT_AHEAD: usize = 4;
 
 #[derive(Debug)]
 struct Sending {
@@ -73,9 +69,17 @@ struct Sending {
 #[derive(Debug)]
 pub(crate) struct Outgoing {
     next_number: u64,
+    /// The peer has all numbers up to this one.
+    acknowledged: u64,
     next_stream: u32,
-    urgent: Ring<Out>,
+    next_order: u64,
+    /// What the peer takes.
+    peer: Limits,
+    lanes: Lanes,
+    lines: Lines,
     topics: BTreeMap<u32, Ring<Out>>,
+    /// The last order that was told before a channel's first message.
+    openings: BTreeMap<u32, u64>,
     /// Topics with something to send; one with a big message under way, or one that is being encoded, is held.
     turns: Turns<u32>,
     sending: VecDeque<Sending>,
@@ -101,9 +105,14 @@ impl Outgoing {
     pub(crate) fn new(max_age: Option<i64>) -> Self {
         Self {
             next_number: 1,
+            acknowledged: 0,
             next_stream: 0,
-            urgent: Ring::unbounded(),
+            next_order: 0,
+            peer: Limits::default(),
+            lanes: Lanes::default(),
+            lines: Lines::default(),
             topics: BTreeMap::new(),
+            openings: BTreeMap::new(),
             turns: Turns::default(),
             sending: VecDeque::new(),
             retransmit: Retransmit::default(),
@@ -120,8 +129,8 @@ impl Outgoing {
         }
     }
 
-    /// Counts what waits and is kept in `budget`. Messages that do not fit are dropped; an urgent record that does not fit is
-    /// the end of the session.
+    /// Counts what waits and is kept in `budget`. Messages and lines that do not fit are dropped; an order, call or answer that
+    /// does not fit is the end of the session.
     pub(crate) fn within(&mut self, budget: &Budget) {
         self.permit = budget.permit();
     }
@@ -131,134 +140,148 @@ impl Outgoing {
         self.full.as_deref()
     }
 
+    /// The peer takes so much.
+    pub(crate) fn set_limits(&mut self, peer: Limits) {
+        self.peer = peer.raise();
+    }
+
+    /// The peer has been told of this channel by what was pushed before: no message of it comes earlier.
+    pub(crate) fn opens(&mut self, channel: u32) {
+        self.openings.insert(channel, self.next_order);
+        self.encoding.add(channel);
+    }
+
     pub(crate) fn push(&mut self, record: &Record, quality: Quality) {
-        let out = Out::of(record, quality);
-        let Some(channel) = out.channel else {
-            if self.takes_urgent(out.held()) {
-                self.urgent.append(out);
+        let lane = match record {
+            Record::Control(_) => Lane::Control,
+            Record::Answer { .. } => Lane::Answers,
+            Record::Data(_) if quality != Quality::InOrder => Lane::Data,
+            Record::Data(_) | Record::Call { .. } => Lane::Calls,
+        };
+        let mut out = self.number(Out::of(record, lane));
+        out.each = quality != Quality::Newest;
+        if lane == Lane::Answers && out.is_big() {
+            out.lane = Lane::LongAnswers;
+        }
+        if out.len() > self.peer.record {
+            let (bytes, limit) = (out.len(), self.peer.record);
+            tracing::warn!(
+                bytes,
+                limit,
+                "a record is longer than the other end of the link takes, and is left out"
+            );
+            if let Some(channel) = out.channel {
+                self.dropped.add(channel, Cause::Full, 1);
             }
             return;
-        };
-        if !self.takes_message(channel, out.held()) {
-            return;
         }
-        let topic = topic(&mut self.topics, channel);
-        // A big message is only ever worth sending while it is the newest.
-        let limit = match out.is_big() {
-            true => BIG_WAITING,
-            false => WAITING,
-        };
-        topic.append(out);
-        let replaced = topic.trim(|topic| {
-            let may = |out: &Out| !out.each || topic.len() > WAITING.messages;
-            let mut older = topic.iter().take(topic.len() - 1);
-            topic.exceeds(limit).then(|| older.position(may))?
-        });
-        self.dropped
-            .add(channel, Cause::Replaced, replaced.messages);
-        self.turns.join(channel);
-        if quality == Quality::Each {
-            self.keep_to_budget(channel);
+        match out.channel.filter(|_| lane == Lane::Data) {
+            Some(channel) => self.push_message(channel, out),
+            None => self.push_required(out),
         }
     }
 
-    /// Ends a channel by this record, after all that waits on it.
-    pub(crate) fn close(&mut self, channel: u32, record: &Record) {
-        let last = Out::closing(channel, record);
-        topic(&mut self.topics, channel).append(last);
-        self.turns.join(channel);
+    /// Sends a line that a node has printed, when there is time.
+    pub(crate) fn print(&mut self, line: &Record) {
+        let line = self.number(Out::of(line, Lane::Lines));
+        self.lines.push(line);
+    }
+
+    fn number(&mut self, out: Out) -> Out {
+        self.next_order += 1;
+        let order = self.next_order;
+        Out { order, ..out }
+    }
+
+    /// Queues what must come. An order, call or answer beyond the limits is the end of the session: to leave one out would be to lose it.
+    fn push_required(&mut self, out: Out) {
+        if self.full.is_some() {
+            return;
+        }
+        let bytes = out.held();
+        let refused = self.lanes.refuse(out.lane, bytes);
+        let refused = refused.or_else(|| Some(self.count_more(bytes).err()?.to_string()));
+        match (refused, out.channel) {
+            (None, _) => self.lanes.push(out),
+            (Some(_), Some(channel)) => self.dropped.add(channel, Cause::Full, 1),
+            (refused, None) => self.full = refused,
+        }
     }
 
     /// Whether the socket has all there is for it.
     pub(crate) fn is_idle(&self) -> bool {
-        self.urgent.is_empty()
+        self.lanes.is_empty()
+            && self.lines.is_empty()
             && self.sending.is_empty()
             && !self.encoding.is_done()
             && (self.turns.is_empty() || self.encoding.is_busy())
     }
 
-    /// Forgets what waits on a channel.
-    pub(crate) fn forget(&mut self, channel: u32) {
-        let waiting = self.topics.remove(&channel).map_or(0, |topic| topic.len());
-        let encoded = self.encoding.forget(channel);
-        self.dropped
-            .add(channel, Cause::Gone, waiting as u64 + u64::from(encoded));
-        self.turns.forget(channel);
-    }
-
     /// Whether anything waits.
     pub(crate) fn is_empty(&self) -> bool {
-        self.urgent.is_empty()
+        self.lanes.is_empty()
+            && self.lines.is_empty()
             && self.turns.is_empty()
             && self.sending.is_empty()
             && self.encoding.is_empty()
     }
 
+    /// How many messages wait on each topic.
+    #[cfg(test)]
+    pub(crate) fn waiting(&self) -> impl Iterator<Item = usize> {
+        self.topics.values().map(Ring::len)
+    }
+
     /// The next frame.
     pub(crate) fn next(&mut self, now: i64) -> Option<Frame> {
-        if let Some(out) = self.urgent.pop().or_else(|| self.encoding.take_done()) {
-            return Some(self.start(out, now));
+        if self.unacknowledged() >= self.peer.ahead {
+            // The peer takes no further number before what is under way has come.
+            return self.next_piece();
         }
-        let turn_for_big = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
-        let message = if turn_for_big {
+        if let Some(line) = self.next_line(false) {
+            return Some(self.start(line, now));
+        }
+        let is_turn_of_long = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
+        let next = if is_turn_of_long {
             None
         } else {
-            self.next_message(now)
+            self.next_record(now)
         };
-        if let Some(out) = message {
-            self.in_a_row += 1;
+        if let Some(out) = next {
+            self.in_a_row = self.in_a_row.wrapping_add(1);
             return Some(self.start(out, now));
         }
         self.in_a_row = 0;
-        self.next_piece()
+        if let Some(piece) = self.next_piece() {
+            return Some(piece);
+        }
+        let line = self.next_line(true)?;
+        Some(self.start(line, now))
     }
 
-    /// The next message in turn, without those that have become too old.
-    fn next_message(&mut self, now: i64) -> Option<Out> {
-        // One is encoded at a time; the others wait for it.
-        let (encoding, topics) = (&mut self.encoding, &mut self.topics);
-        let busy = encoding.is_busy();
-        let channel = self.turns.take(|channel| {
-            let first = topics.get(channel).and_then(Ring::front);
-            !busy || first.is_none_or(|first| !encoding.wants(first))
-        })?;
-        let topic = topics.get_mut(&channel)?;
-        let is_stale =
-            |first: &Out| !first.each && self.max_age.is_some_and(|age| now - first.born > age);
-        let stale = topic.trim(|topic| {
-            let stale = topic.len() > 1 && topic.front().is_some_and(is_stale);
-            stale.then_some(0)
-        });
-        self.dropped.add(channel, Cause::Stale, stale.messages);
-        let out = topic.pop()?;
-        if !encoding.wants(&out) {
-            return Some(out);
-        }
-        if busy {
-            // The one before it had grown too old.
-            topic.put_back(out);
-            self.turns.join(channel);
+    fn next_line(&mut self, is_alone: bool) -> Option<Out> {
+        let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
+        self.lines.take(is_alone, |out| gate.lets(out))
+    }
+
+    /// Numbers that were used and that the peer has not said to have, all before them included.
+    pub(crate) fn unacknowledged(&self) -> usize {
+        usize::try_from(self.next_number - 1 - self.acknowledged).unwrap_or(usize::MAX)
+    }
+
+    fn next_record(&mut self, now: i64) -> Option<Out> {
+        let is_turn_of_data = self.in_a_row % TURN_OF_DATA == TURN_OF_DATA - 1;
+        let data = if is_turn_of_data {
+            self.next_data(now)
         } else {
-            encoding.begin(out);
-            self.turns.hold(channel);
-        }
-        None
-    }
-
-    /// The topic of a message that has left has its next turn.
-    fn turn_after(&mut self, out: &Out) {
-        let Some(channel) = out.channel else {
-            return;
+            None
         };
-        match self.topics.get(&channel) {
-            None => self.turns.forget(channel),
-            Some(topic) => {
-                self.turns.release(channel);
-                if !topic.is_empty() {
-                    self.turns.join(channel);
-                }
-            }
-        }
+        let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
+        let place = data
+            .is_none()
+            .then(|| self.lanes.first(|out| gate.lets(out)));
+        let required = place.flatten().and_then(|lane| self.lanes.take(lane));
+        data.or(required).or_else(|| self.next_data(now))
     }
 
     fn start(&mut self, mut out: Out, now: i64) -> Frame {
@@ -267,7 +290,7 @@ impl Outgoing {
         }
         let length = out.len();
         let again = self.retransmit.takes(&out);
-        let number = if again || self.retransmit.len() < MAX_URGENT {
+        let number = if again || self.unacknowledged() < self.peer.ahead / UNKEPT_AHEAD {
             self.next_number += 1;
             self.next_number - 1
         } else {
@@ -275,20 +298,20 @@ impl Outgoing {
         };
         if length <= SMALL {
             self.turn_after(&out);
-            self.sent += length as u64;
             let record = out.piece(0, length);
+            self.count_sent(out.lane, length);
             self.retransmit.add(number, again, out);
             return Frame::Whole { number, record };
         }
         // The topic waits until it is through.
-        if let Some(channel) = out.channel {
+        if let Some(channel) = out.channel.filter(|_| out.lane == Lane::Data) {
             self.turns.hold(channel);
         }
         let stream = self.next_stream;
         self.next_stream = self.next_stream.wrapping_add(1);
         // On a quick link a piece may be longer than the record; the rest must not be empty.
         let bytes = out.piece(0, self.piece.min(length - 1));
-        self.sent += bytes.len() as u64;
+        self.count_sent(out.lane, bytes.len());
         let total = u32::try_from(length).unwrap_or(u32::MAX);
         let at = bytes.len();
         self.sending.push_back(Sending {
@@ -306,11 +329,18 @@ impl Outgoing {
         }
     }
 
+    fn count_sent(&mut self, lane: Lane, bytes: usize) {
+        self.sent += bytes as u64;
+        if lane != Lane::Lines {
+            self.lines.earn(bytes);
+        }
+    }
+
     fn next_piece(&mut self) -> Option<Frame> {
         let mut sending = self.sending.pop_front()?;
         let bytes = sending.out.piece(sending.at, self.piece);
         sending.at += bytes.len();
-        self.sent += bytes.len() as u64;
+        self.count_sent(sending.out.lane, bytes.len());
         let stream = sending.stream;
         if sending.at < sending.out.len() {
             self.sending.push_back(sending);
@@ -322,85 +352,27 @@ impl Outgoing {
         Some(Frame::More { stream, bytes })
     }
 
-    /// The peer has all numbers up to this one.
-    pub(crate) fn acknowledge(&mut self, number: u64) {
-        while let Some(out) = self.retransmit.acknowledged(number) {
-            // All that went before it has come, too.
-            if let Some(channel) = out.channel.filter(|_| out.closes) {
-                self.topics.remove(&channel);
-                self.turns.forget(channel);
-                self.encoding.remove(channel);
-                self.closed.push(channel);
-            }
-        }
-        self.count_less();
-    }
-
-    /// A message came and could not be decoded: where each one counts it goes once more, unless a newer one of a
-    /// latched topic has gone. Says whether it does.
-    pub(crate) fn again(&mut self, channel: u32, born: i64) -> bool {
-        let Some(again) = self.retransmit.damaged(channel, born) else {
-            return false;
-        };
-        topic(&mut self.topics, channel).put_back(again);
-        self.turns.join(channel);
-        true
-    }
-
     /// The link carries so many bytes per second.
     pub(crate) fn set_throughput(&mut self, bytes_per_second: f64) {
         let piece = (bytes_per_second * PIECE_TIME) as usize;
         self.piece = piece.clamp(PIECES.0, PIECES.1);
     }
 
+    /// Bytes that the socket is to hold before it is given no more: what waits in it, a small message waits for.
+    pub(crate) fn low_water(&self) -> usize {
+        LOW_WATER.min(2 * self.piece)
+    }
+
     /// Begins with this number, which the peer was told to expect.
     pub(crate) fn begin_at(&mut self, number: u64) {
-        self.next_number = number;
+        self.next_number = number.max(1);
+        self.acknowledged = self.next_number - 1;
     }
 
     /// The first number on the next connection.
     pub(crate) fn next_number(&self) -> u64 {
         self.next_number
     }
-
-    /// A new connection, the peer having all up to `received` and those `ahead`: the rest of what was kept goes first,
-    /// in order. Big messages that were under way are lost unless each one counts.
-    pub(crate) fn reconnect(&mut self, received: u64, ahead: &[u64]) {
-        for out in self.encoding.give_up() {
-            if let Some(channel) = out.channel {
-                let topic = topic(&mut self.topics, channel);
-                if out.each || topic.is_empty() {
-                    topic.put_back(out);
-                } else {
-                    self.dropped.add(channel, Cause::Replaced, 1);
-                }
-            }
-        }
-        for sending in std::mem::take(&mut self.sending) {
-            self.retransmit
-                .add(sending.number, sending.again, sending.out);
-        }
-        for (number, sent) in std::mem::take(&mut self.retransmit).into_records().rev() {
-            if number <= received || ahead.contains(&number) {
-                continue;
-            }
-            match sent {
-                Sent::Once(channel) => self.dropped.add(channel, Cause::CutOff, 1),
-                Sent::Again(out) => match out.channel {
-                    None => self.urgent.put_back(out),
-                    Some(channel) => topic(&mut self.topics, channel).put_back(out),
-                },
-            }
-        }
-        self.turns = Turns::default();
-        let waiting = self.topics.iter().filter(|(_, topic)| !topic.is_empty());
-        waiting.for_each(|(channel, _)| self.turns.join(*channel));
-    }
-}
-
-/// What waits on a channel. Only this module drops something of it.
-fn topic(topics: &mut BTreeMap<u32, Ring<Out>>, channel: u32) -> &mut Ring<Out> {
-    topics.entry(channel).or_insert_with(Ring::unbounded)
 }
 
 #[cfg(test)]

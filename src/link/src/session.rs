@@ -10,7 +10,7 @@ use std::marker::PhantomData;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
-use budget::{Budget, Permit};
+use budget::{Budget, JsonWeight, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use serde::Serialize;
@@ -25,7 +25,7 @@ use crate::incoming::Incoming;
 use crate::outgoing::{Outgoing, Quality};
 use crate::packing::Packing;
 use crate::record::{Data, Record};
-use crate::{Error, MAX_TOLD, control};
+use crate::{Error, Limits, MAX_RECORD, MAX_TOLD, control};
 
 pub use opening::{receive_open, send_open};
 use throughput::{Counters, Throughput};
@@ -37,6 +37,9 @@ const LOST: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(
 
 /// What errors call the memory for orders.
 const TOLD: &str = "what the other end of a link tells";
+
+/// The longest response, for which there is room in a record.
+const MAX_RESPONSE: usize = MAX_RECORD - 1024;
 
 /// And the memory for calls, half of a session's: what is under way has room beside them.
 const CALLED: &str = "calls of the other end of a link";
@@ -153,11 +156,19 @@ struct State {
     clock: Clock,
     packing: Packing,
     throughput: Throughput,
-    ending: Option<(u16, String)>,
+    ending: Option<Ending>,
     /// What this side's channels stand for, until the peer knows that they are gone.
     topics: BTreeMap<u32, String>,
     /// What was dropped of those that are gone.
     dropped: Tally<String>,
+}
+
+/// How this side has ended the session.
+struct Ending {
+    /// WebSocket close code.
+    code: u16,
+    reason: String,
+    at: Instant,
 }
 
 impl State {
@@ -281,29 +292,26 @@ impl<O: Order> Session<O> {
         (state.out.sent, state.incoming.received().bytes)
     }
 
-    /// Tells the peer something; it will come, in order, over however many connections.
+    /// Tells the peer something; it will come, in order, over however many connections. A line of a node comes when there is time, or is left
+    /// out, which the next line tells.
     pub fn report(&self, order: &O) {
-        self.control(order);
+        let Some(record) = control_record(order) else {
+            return;
+        };
+        let out = &mut self.state.lock().out;
+        if order.is_line() {
+            out.print(&record);
+        } else {
+            out.push(&record, Quality::Each);
+        }
+        self.wake.notify_one();
     }
 
     /// Has the peer's session send a frame that refers to none before it.
     fn ask_for_keyframe(&self, channel: u32) {
-        self.control(&Between::Keyframe { channel });
-    }
-
-    fn control(&self, told: &impl Serialize) {
-        let json = serde_json::to_vec(told).unwrap_or_default();
-        let (bytes, limit) = (json.len(), control::longest(&json));
-        if bytes > limit {
-            // The peer would end the link.
-            tracing::warn!(
-                bytes,
-                limit,
-                "something is too long to be told to the other end of the link"
-            );
-            return;
+        if let Some(record) = control_record(&Between::Keyframe { channel }) {
+            self.push(&record, Quality::Each);
         }
-        self.push(&Record::Control(json.into()), Quality::Each);
     }
 
     /// Sends a message of a topic.
@@ -325,6 +333,12 @@ impl<O: Order> Session<O> {
 
     /// Answers a call that had arrived at `taken` (nanoseconds since 1970).
     pub fn answer(&self, id: u32, taken: i64, response: Result<Bytes, String>) {
+        let response = response.and_then(|response| match response.len() {
+            0..MAX_RESPONSE => Ok(response),
+            bytes => Err(format!(
+                "the response has {bytes} bytes, more than a link carries ({MAX_RESPONSE})"
+            )),
+        });
         let answer = Record::Answer {
             id,
             taken,
@@ -334,18 +348,23 @@ impl<O: Order> Session<O> {
         self.push(&answer, Quality::Each);
     }
 
-    /// This side will send a topic's messages as this channel. They may be made smaller, by what is known of their
+    /// This side will send a topic's messages as this channel, of which the peer was told just now. They may be made smaller, by what is known of their
     /// type.
     pub fn opens(&self, channel: u32, topic: &str, schema: codec::Schema) {
         let mut state = self.state.lock();
         state.topics.insert(channel, topic.to_owned());
         state.packing.add(channel, schema);
-        state.out.encoding.add(channel);
+        state.out.opens(channel);
     }
 
     /// Quality of JPEG pictures, 1 to 100; 80 where absent.
     pub fn set_quality(&self, quality: Option<u8>) {
         self.state.lock().packing.set_quality(quality);
+    }
+
+    /// The peer takes so much, as its opening frame says. Before [`reconnect`](Self::reconnect).
+    pub fn peer_takes(&self, limits: Limits) {
+        self.state.lock().out.set_limits(limits);
     }
 
     /// The peer decodes these, as its opening frame says.
@@ -373,9 +392,13 @@ impl<O: Order> Session<O> {
         state.packing.remove(channel);
     }
 
-    /// Ends the connection, once what waits was sent.
+    /// Ends the connection, once what waits was sent, or the peer takes none of it for two seconds.
     pub fn end(&self, code: u16, reason: &str) {
-        self.state.lock().ending = Some((code, reason.to_owned()));
+        self.state.lock().ending = Some(Ending {
+            code,
+            reason: reason.to_owned(),
+            at: Instant::now(),
+        });
         self.wake.notify_one();
     }
 
@@ -418,6 +441,24 @@ impl<O: Order> Session<O> {
             state.out.encoding.set_pays(pays);
         }
     }
+}
+
+/// What is told, as a record; none where the peer would not read it.
+fn control_record(told: &impl Serialize) -> Option<Record> {
+    let json = serde_json::to_vec(told).unwrap_or_default();
+    let (bytes, limit) = (json.len(), control::longest(&json));
+    let (weight, room) = (JsonWeight::of(&json).bytes, MAX_TOLD);
+    if bytes > limit || weight > room {
+        tracing::warn!(
+            bytes,
+            limit,
+            weight,
+            room,
+            "something is too long to be told to the other end of the link"
+        );
+        return None;
+    }
+    Some(Record::Control(json.into()))
 }
 
 impl Session<FromRobot> {

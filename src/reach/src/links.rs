@@ -34,6 +34,7 @@ mod types;
 mod unsent;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -44,6 +45,7 @@ use ros::bus::{Bus, Graph, ParamValue, RosVersion};
 use ros::schema::Registry;
 use ros::sizes::{Inputs, Seen};
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::runtime::Handle;
 use tokio::sync::{OnceCell, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
@@ -52,7 +54,7 @@ use link::control::{FromCloud, Hello, Sla, Welcome};
 use link::packing::decoded_here;
 use link::session::{Lost, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
-use link::{MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
+use link::{Limits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 
 use crate::Flow;
 use attempts::Attempts;
@@ -182,7 +184,7 @@ impl Hub {
         self.inputs.seen()
     }
 
-    /// Ends every connection with these words, and all links.
+    /// Ends every connection with these words, once what waits for its robot was sent (within seconds), and all links.
     pub fn close(&self, reason: &str) {
         self.closed.send_replace(Some(reason.to_owned()));
         for link in std::mem::take(&mut *self.links.lock()).into_values() {
@@ -236,6 +238,12 @@ impl Hub {
                 };
             }
         };
+        let mut carrying = Carrying {
+            hub: self,
+            link: &link,
+            turn,
+            is_ended: false,
+        };
         // They have been set in the servant: what is kept of a hello is small.
         hello.parameters.clear();
         drop(held);
@@ -256,6 +264,7 @@ impl Hub {
             ahead,
             next,
             codecs: decoded_here(|codec| hello.codecs.iter().any(|name| name == codec.name())),
+            limits: Limits::default(),
             servant: self.servant.clone(),
         };
         let (theirs, theirs_ahead) = hello
@@ -265,10 +274,10 @@ impl Hub {
             .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
         link.session.set_quality(hello.quality);
         link.session.peer_decodes(&hello.codecs);
+        link.session.peer_takes(hello.limits);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
         link.requests.connected(Instant::now());
         if let Err(lost) = send_open(&mut socket, &welcome).await {
-            self.expire(&link, turn);
             return lost;
         }
         tracing::info!(
@@ -277,21 +286,29 @@ impl Hub {
             resumed,
             "a robot's node is linked"
         );
-        let lost = tokio::select! {
-            lost = link.session.run(&mut socket, &*link) => lost,
-            _ = kicked.wait_for(|kicks| *kicks != turn) => return replaced_by_another(),
+        let lost = {
+            let mut running = pin!(link.session.run(&mut socket, &*link));
+            let replaced = async { kicked.wait_for(|kicks| *kicks != turn).await.is_ok() };
+            let lost = tokio::select! {
+                lost = &mut running => Some(lost),
+                _ = replaced => None,
+            };
+            match (lost, self.check_open()) {
+                (Some(lost), _) => lost,
+                // The robot is told why.
+                (None, Err(_)) => running.await,
+                (None, Ok(())) => return replaced_by_another(),
+            }
         };
-        let for_good = matches!(
+        carrying.is_ended = matches!(
             lost,
             Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full(_)
         );
         if matches!(lost, Lost::Closed { code: 1000, .. }) {
             self.attempts.ended(&hello.run);
         }
-        if for_good {
+        if carrying.is_ended {
             self.end(&link, turn).await;
-        } else {
-            self.expire(&link, turn);
         }
         lost
     }
@@ -478,6 +495,23 @@ impl Hub {
             if timeout(patience, self.nodes.ended(node)).await.is_ok() {
                 return;
             }
+        }
+    }
+}
+
+/// A connection that carries a link. However it ends, dropped in the middle of it included, the link expires, unless it was ended for good.
+struct Carrying<'a> {
+    hub: &'a Arc<Hub>,
+    link: &'a Arc<NodeLink>,
+    turn: u64,
+    is_ended: bool,
+}
+
+impl Drop for Carrying<'_> {
+    fn drop(&mut self) {
+        // As the daemon ends there is nobody to wait for it.
+        if !self.is_ended && Handle::try_current().is_ok() {
+            self.hub.expire(self.link, self.turn);
         }
     }
 }

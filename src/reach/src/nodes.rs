@@ -276,7 +276,10 @@ impl Nodes for LinkedNodes {
                 tokio::select! {
                     line = all.recv() => match line {
                         Some(line) if line.node == node => {
-                            let _ = sender.try_send((line.stream == "stderr", line.line));
+                            // The log waits meanwhile: the link alone leaves lines out, and counts them.
+                            if sender.send((line.stream == "stderr", line.line)).await.is_err() {
+                                return;
+                            }
                         }
                         Some(_) => {}
                         None => return,

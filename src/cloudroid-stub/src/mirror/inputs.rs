@@ -12,7 +12,6 @@ use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use ros::bus::{Digest, Matched, Message, Peer, PeerId, Qos, WireType};
-use ros::ros1::actions;
 use tokio::task::AbortHandle;
 
 use super::Mirror;
@@ -116,14 +115,7 @@ impl Inputs {
                 &message.wire_type,
             )
         };
-        // Goals and what cancels them are no stream of which the newest would do.
-        let of = &message.wire_type.name;
-        let of_action = actions::carries_goal_id(of) || actions::commands(of);
-        let quality = if message.latching || of_action {
-            Quality::Each
-        } else {
-            Quality::Newest
-        };
+        let quality = Quality::of(&message.wire_type.name, message.latching);
         let data = Data {
             channel,
             encoded: false,

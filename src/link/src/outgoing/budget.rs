@@ -1,15 +1,14 @@
 //! Limits the bytes that wait for the peer: of messages that must all arrive (latched messages, messages of actions), which are
-//! within the limit not dropped in favour of newer ones; of urgent records; and of everything, in the budget of the session's
-//! owner.
+//! within the limit not dropped in favour of newer ones; and of everything, in the budget of the session's owner.
 
 use ::budget::{Exceeded, UNCOUNTED};
 use ros::ring::{Held, Ring};
 
-use super::{MAX_URGENT, MAX_URGENT_BYTES, Out, Outgoing};
+use super::lanes::Lane;
+use super::{Out, Outgoing};
 use crate::drops::Cause;
+use crate::limits::EACH;
 
-/// Bytes of such messages that may wait, over all topics, beside the last one; and that are kept until they are acknowledged.
-pub(super) const EACH: usize = 64 << 20;
 /// Bytes below which a topic's messages are not dropped, as long as another topic has more than its last message.
 const LITTLE: usize = 1 << 20;
 
@@ -34,29 +33,6 @@ impl Out {
 }
 
 impl Outgoing {
-    /// Whether an urgent record of `bytes` bytes may be queued beside those that wait, are under way and are kept until the peer
-    /// has them. If not, the session is given up: to leave one out would be to lose a call or its answer.
-    pub(super) fn takes_urgent(&mut self, bytes: usize) -> bool {
-        if self.full.is_some() {
-            return false;
-        }
-        let sending = self.sending.iter().filter(|one| one.out.channel.is_none());
-        let (started, started_bytes) = sending.fold((0, 0), |(count, sum), one| {
-            (count + 1, sum + one.out.held())
-        });
-        let count = self.urgent.len() + self.retransmit.urgent + started;
-        let sum = self.urgent.bytes() + self.retransmit.bytes + started_bytes;
-        let too_much = count >= MAX_URGENT || (count > 0 && sum + bytes > MAX_URGENT_BYTES);
-        self.full = match self.count_more(bytes) {
-            _ if too_much => Some(format!(
-                "{count} records of {sum} bytes wait for it or are not acknowledged"
-            )),
-            Ok(()) => None,
-            Err(full) => Some(full.to_string()),
-        };
-        self.full.is_none()
-    }
-
     /// Whether a message of `bytes` bytes may be queued. Where there is no room it takes the place of older ones of its topic;
     /// without any it is dropped.
     pub(super) fn takes_message(&mut self, channel: u32, bytes: usize) -> bool {
@@ -81,13 +57,18 @@ impl Outgoing {
     fn held(&self) -> usize {
         let topics: usize = self.topics.values().map(Ring::bytes).sum();
         let sending = self.sending.iter().map(|sending| &sending.out);
-        let under_way = sending.chain(self.encoding.messages());
-        let under_way: usize = under_way.map(Held::held).sum();
-        self.urgent.bytes() + topics + under_way + self.retransmit.bytes + self.retransmit.big
+        // Of other lanes it counts there until the peer has it.
+        let sending = sending.filter(|out| out.lane == Lane::Data);
+        let under_way: usize = sending
+            .chain(self.encoding.messages())
+            .map(Held::held)
+            .sum();
+        let waiting = self.lanes.bytes() + self.lines.bytes() + topics;
+        waiting + under_way + self.retransmit.bytes + self.retransmit.big
     }
 
     /// Counts `bytes` more. The sum is made only when enough has come together.
-    fn count_more(&mut self, bytes: usize) -> Result<(), Exceeded> {
+    pub(super) fn count_more(&mut self, bytes: usize) -> Result<(), Exceeded> {
         let uncounted = self.uncounted + bytes;
         if uncounted > UNCOUNTED {
             self.permit.count(self.held() + bytes)?;
@@ -117,14 +98,12 @@ impl Outgoing {
             if all - last.map_or(0, Held::held).min(all) <= EACH {
                 return;
             }
-            let size = |&&(_, (_, bytes)): &&(u32, (usize, usize))| bytes;
-            let followed = topics
-                .iter()
-                .filter(|(_, (count, bytes))| *count > 1 && *bytes > LITTLE);
+            // One that is followed by newer ones goes first.
             let others = topics
                 .iter()
                 .filter(|(of, (count, _))| *of != channel || *count > 1);
-            let biggest = followed.max_by_key(size).or(others.max_by_key(size));
+            let biggest =
+                others.max_by_key(|(_, (count, bytes))| (*count > 1 && *bytes > LITTLE, *bytes));
             let Some(&(of, _)) = biggest else { return };
             let Some(waiting) = self.topics.get_mut(&of) else {
                 return;

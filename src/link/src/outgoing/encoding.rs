@@ -87,9 +87,9 @@ impl Encoding {
         self.done = Some(out);
     }
 
-    /// The message that was encoded.
-    pub(super) fn take_done(&mut self) -> Option<Out> {
-        self.done.take()
+    /// The message that was encoded, if it `may` go.
+    pub(super) fn take_done(&mut self, may: impl FnOnce(&mut Out) -> bool) -> Option<Out> {
+        self.done.take_if(may)
     }
 
     pub(super) fn is_done(&self) -> bool {

@@ -2,17 +2,48 @@
 
 use bytes::{BufMut, Bytes, BytesMut};
 use ros::ring::Held;
+use ros::ros1::actions;
 
-use super::{Quality, SMALL};
+use super::SMALL;
+use super::lanes::Lane;
 use crate::record::Record;
+
+/// How a message may be treated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quality {
+    /// A newer one may take its place.
+    Newest,
+    /// Every one counts (latched messages, results): never dropped for its age.
+    Each,
+    /// Every one counts, and none comes before another one of any topic that was sent before it (goals, and what cancels them), nor before a
+    /// call.
+    InOrder,
+}
+
+impl Quality {
+    /// How a message of this type is treated: goals, what cancels them, and what comes of them are no stream of which the newest would do.
+    pub fn of(type_name: &str, is_latching: bool) -> Self {
+        if actions::commands(type_name) {
+            Self::InOrder
+        } else if is_latching || actions::carries_goal_id(type_name) {
+            Self::Each
+        } else {
+            Self::Newest
+        }
+    }
+}
 
 #[derive(Debug, Clone)]
 pub(crate) struct Out {
     pub(super) head: BytesMut,
     pub(super) payload: Bytes,
     pub(super) born: i64,
+    /// Every one counts.
     pub(super) each: bool,
-    /// The topic's channel; none: urgent.
+    pub(super) lane: Lane,
+    /// Counts all records of the session in the order in which they were pushed.
+    pub(super) order: u64,
+    /// Of a message, and of what closes its channel.
     pub(super) channel: Option<u32>,
     /// The message before it was encoded, where each one counts: it may come damaged.
     pub(super) plain: Option<Bytes>,
@@ -28,7 +59,7 @@ impl Held for Out {
 }
 
 impl Out {
-    pub(super) fn of(record: &Record, quality: Quality) -> Self {
+    pub(super) fn of(record: &Record, lane: Lane) -> Self {
         let (head, payload) = record.parts();
         let (channel, born) = match record {
             Record::Data(data) => (Some(data.channel), data.born),
@@ -38,19 +69,12 @@ impl Out {
             head,
             payload,
             born,
-            each: quality == Quality::Each,
+            each: false,
+            lane,
+            order: 0,
             channel,
             plain: None,
             closes: false,
-        }
-    }
-
-    /// The last record of this channel.
-    pub(super) fn closing(channel: u32, record: &Record) -> Self {
-        Self {
-            channel: Some(channel),
-            closes: true,
-            ..Self::of(record, Quality::Each)
         }
     }
 
@@ -61,6 +85,26 @@ impl Out {
 
     pub(super) fn is_big(&self) -> bool {
         self.held() > SMALL
+    }
+
+    /// It must come, but for the limits of its lane.
+    pub(super) fn must_come(&self) -> bool {
+        match self.lane {
+            Lane::Data => self.closes,
+            // What tells of others that were left out.
+            Lane::Lines => self.each,
+            _ => true,
+        }
+    }
+
+    /// Whether it may come before another record that is under way.
+    pub(super) fn passes(&self, other: &Self) -> bool {
+        match self.lane {
+            _ if self.lane != other.lane => true,
+            Lane::LongAnswers => true,
+            Lane::Data => self.channel != other.channel,
+            _ => false,
+        }
     }
 
     /// Bytes from `at` on, at most `length`.

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::incoming::Incoming;
+use crate::limits::{ANSWERS, CALLS};
 use crate::record::Data;
 
 fn data(channel: u32, born: i64, size: usize) -> Record {
@@ -232,7 +233,6 @@ proptest! {
             incoming.reconnect(out.next_number());
             out.reconnect(received, &ahead);
         }
-        calls.sort_unstable();
         let expected: Vec<u32> = (0..sizes.len() as u32).collect();
         prop_assert_eq!(calls, expected);
         let expected: Vec<i64> = (0..sizes.len() as i64).collect();
@@ -476,32 +476,123 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         let mut pushed = 0;
         // It reads everything, at once.
         while out.is_full().is_none() {
-            assert!(pushed <= MAX_URGENT, "{pushed} answers of {size} bytes");
+            assert!(
+                pushed <= ANSWERS.messages,
+                "{pushed} answers of {size} bytes"
+            );
             out.push(&answer(size), Quality::Each);
             while out.next(0).is_some() {}
             pushed += 1;
         }
-        assert!(pushed * size <= MAX_URGENT_BYTES + size);
+        assert!(pushed * size <= ANSWERS.bytes + size);
         let reason = out.is_full().unwrap().to_owned();
         assert!(reason.contains("not acknowledged"), "{reason}");
         // What comes then is not kept any more.
-        let held = out.retransmit.bytes;
+        let held = out.lanes.bytes();
         out.push(&answer(size), Quality::Each);
-        assert!((out.next(0).is_none(), out.retransmit.bytes) == (true, held));
+        assert!((out.next(0).is_none(), out.lanes.bytes()) == (true, held));
     }
-    // One that does may be sent as much as it likes, and one answer may be longer than all may be together.
+    // One that does may be sent as much as it likes.
     let mut out = Outgoing::new(None);
-    for _ in 0..2 * MAX_URGENT {
+    for _ in 0..2 * ANSWERS.messages {
         out.push(&answer(10), Quality::Each);
         out.next(0).unwrap();
         out.acknowledge(out.next_number() - 1);
     }
-    assert_eq!(
-        (out.is_full(), out.retransmit.urgent, out.retransmit.bytes),
-        (None, 0, 0)
-    );
-    out.push(&answer(MAX_URGENT_BYTES + 1), Quality::Each);
-    assert_eq!(out.is_full(), None);
+    assert_eq!((out.is_full(), out.lanes.bytes()), (None, 0));
+}
+
+#[test]
+fn goals_and_what_cancels_them_come_in_order_and_results_all() {
+    for (of, quality) in [
+        ("move_base_msgs/MoveBaseActionGoal", Quality::InOrder),
+        ("actionlib_msgs/GoalID", Quality::InOrder),
+        ("move_base_msgs/MoveBaseActionResult", Quality::Each),
+        ("sensor_msgs/Image", Quality::Newest),
+    ] {
+        assert_eq!(Quality::of(of, false), quality, "{of}");
+    }
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    out.push(&data(1, 1, 10 * SMALL), Quality::InOrder);
+    out.push(&data(2, 2, 10), Quality::InOrder);
+    let came: Vec<i64> = std::iter::from_fn(|| out.next(0))
+        .filter_map(|frame| born(deliver(&mut incoming, frame)))
+        .collect();
+    assert_eq!(came, [1, 2], "the goal, and then what cancels it");
+}
+
+#[test]
+fn goals_beyond_the_limit_are_dropped_and_counted() {
+    let mut out = Outgoing::new(None);
+    for number in 0..CALLS.messages as i64 + 3 {
+        out.push(&data(1, number, 10), Quality::InOrder);
+    }
+    assert_eq!((out.is_full(), dropped(&out, 1, Cause::Full)), (None, 3));
+}
+
+#[test]
+fn what_is_longer_than_the_peer_takes_is_left_out_and_counted() {
+    let mut out = Outgoing::new(None);
+    let record = 2 << 20;
+    out.set_limits(Limits {
+        record,
+        ..Limits::default()
+    });
+    out.push(&data(1, 1, record), Quality::Each);
+    out.push(&data(1, 2, record - 100), Quality::Each);
+    assert_eq!(dropped(&out, 1, Cause::Full), 1);
+    assert!(matches!(out.next(0), Some(Frame::Begin { total, .. }) if total as usize <= record));
+}
+
+#[test]
+fn limits_without_which_nothing_could_be_sent_are_not_believed() {
+    let mut out = Outgoing::new(None);
+    out.set_limits(Limits {
+        record: 0,
+        under_way: 0,
+        under_way_bytes: 0,
+        ahead: 0,
+    });
+    out.push(&control(1), Quality::Each);
+    out.push(&data(1, 1, 100_000), Quality::Each);
+    assert!(out.next(0).is_some() && out.next(0).is_some());
+}
+
+#[test]
+fn on_a_slow_link_a_short_message_waits_for_a_tenth_of_a_second_of_pictures() {
+    const RATE: f64 = 500e3 / 8.0;
+    let mut out = Outgoing::new(None);
+    out.set_throughput(RATE);
+    for channel in 1..=3 {
+        out.push(&data(channel, 1, 100_000), Quality::Newest);
+        assert!(matches!(out.next(0), Some(Frame::Begin { .. })));
+    }
+    let mut waits = Vec::new();
+    for born in 0..20 {
+        // What the socket holds, and then what is before it.
+        let mut before = out.low_water();
+        out.push(&data(9, born, 50), Quality::Newest);
+        while let Some(Frame::More { bytes, .. } | Frame::Begin { bytes, .. }) = out.next(0) {
+            before += bytes.len();
+        }
+        waits.push(before as f64 / RATE);
+    }
+    waits.sort_by(f64::total_cmp);
+    assert!(waits[18] < 0.14, "{waits:?}");
+}
+
+#[test]
+fn a_flood_of_calls_does_not_stop_messages() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    for _ in 0..1000 {
+        out.push(&answer(10), Quality::Each);
+    }
+    out.push(&data(1, 7, 10), Quality::Newest);
+    let came: Vec<Option<i64>> = std::iter::from_fn(|| out.next(0))
+        .map(|frame| born(deliver(&mut incoming, frame)))
+        .collect();
+    let at = came.iter().position(|born| *born == Some(7));
+    assert!(at < Some(5), "{at:?}");
 }
 
 #[test]

@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, Sleep, sleep_until};
+use tokio::time::{Instant, Sleep, sleep_until, timeout};
 use ws::{Message, WebSocket, WsError, frame as opcode};
 
 use super::{Handler, Lost, Session, SessionOptions};
@@ -20,14 +21,16 @@ use crate::frame::{Frame, Received};
 use crate::packing::Packed;
 use crate::record::Record;
 
-/// The socket is given more only when it holds less than this: what is decided later is decided better.
-const LOW_WATER: usize = 24 * 1024;
 /// Acknowledged at the latest after so many records, and bytes.
 const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
 /// After so many messages in a row those who pass them on have their turn, or their queues would overflow.
 const IN_A_ROW: u32 = 32;
 /// Bytes that a call takes beside its request, until it is answered.
 const CALL: usize = 1024;
+/// For the peer to take what still waits when this side ends the session: without a sign of it, and at most.
+const TAKES: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(10));
+/// For its close frame after that.
+const FAREWELL: Duration = Duration::from_secs(1);
 /// Exchanges made at once on a new connection, to know the peer's clock.
 const FIRST_PINGS: u32 = 6;
 
@@ -38,18 +41,28 @@ impl<O: Order> Session<O> {
         S: AsyncRead + AsyncWrite + Unpin,
         H: Handler<O::OfPeer> + ?Sized,
     {
-        let lost = match self.carry(socket, handler).await {
-            Ok(never) => match never {},
-            Err(lost) => lost,
+        let lost = {
+            // Nothing carries the session any more when this future is dropped, either.
+            let _down = Down(&self.up);
+            match self.carry(socket, handler).await {
+                Ok(never) => match never {},
+                Err(lost) => lost,
+            }
         };
-        self.up.send_replace(false);
         let goodbye = match &lost {
-            Lost::Ended => self.state.lock().ending.clone(),
+            Lost::Ended => {
+                let ending = &self.state.lock().ending;
+                ending
+                    .as_ref()
+                    .map(|ending| (ending.code, ending.reason.clone()))
+            }
+            Lost::Closed { code, .. } => Some((*code, String::new())),
             lost => lost.goodbye(),
         };
         if let Some((code, reason)) = goodbye {
             socket.queue_close(code, &reason);
-            let _ = tokio::time::timeout(Duration::from_secs(1), socket.leave(true)).await;
+            let is_closed = matches!(lost, Lost::Closed { .. });
+            let _ = timeout(FAREWELL, socket.leave(!is_closed)).await;
         }
         lost
     }
@@ -93,7 +106,7 @@ impl<O: Order> Session<O> {
                         Poll::Pending => break,
                     }
                 }
-                if socket.queued() == 0 && self.has_ended() {
+                if self.has_ended(&connection, socket.queued()) {
                     return Poll::Ready(Event::Ended);
                 }
                 if let Poll::Ready(message) = socket.poll_next(cx) {
@@ -124,8 +137,6 @@ impl<O: Order> Session<O> {
                             return Err(Error::Protocol("text, where frames are binary").into());
                         }
                         Message::Close(code, reason) => {
-                            socket.queue_close(code, "");
-                            let _ = poll_fn(|cx| socket.poll_flush(cx)).await;
                             return Err(Lost::Closed { code, reason });
                         }
                     }
@@ -136,6 +147,10 @@ impl<O: Order> Session<O> {
                     }
                     if self.asked.swap(false, Ordering::Relaxed) {
                         connection.ping(self, socket);
+                    }
+                    if let Some(by) = self.ends_by(&connection) {
+                        let first = by.min(tick.deadline());
+                        Sleep::reset(tick.as_mut(), first);
                     }
                 }
                 Event::Ended => return Err(Lost::Ended),
@@ -151,23 +166,31 @@ impl<O: Order> Session<O> {
                         connection.ping(self, socket);
                     }
                     let next = connection.next_tick(&self.options);
-                    Sleep::reset(tick.as_mut(), next);
+                    let by = self.ends_by(&connection).unwrap_or(next);
+                    Sleep::reset(tick.as_mut(), next.min(by));
                 }
             }
         }
     }
 
-    fn has_ended(&self) -> bool {
-        let state = self.state.lock();
-        state.ending.is_some() && state.out.is_empty()
+    /// Whether this side has ended the session and the peer has all that waited, or had time enough.
+    fn has_ended(&self, connection: &Connection, queued: usize) -> bool {
+        let by = self.ends_by(connection);
+        let is_through = || queued == 0 && self.state.lock().out.is_empty();
+        by.is_some_and(|by| by <= Instant::now() || is_through())
+    }
+
+    /// When what the peer does not take is given up, where this side has ended the session.
+    fn ends_by(&self, connection: &Connection) -> Option<Instant> {
+        let ended = self.state.lock().ending.as_ref()?.at.max(connection.begun);
+        let (unheard, most) = TAKES;
+        Some((connection.heard.max(ended) + unheard).min(ended + most))
     }
 
     fn fill<S: AsyncRead + AsyncWrite + Unpin>(&self, socket: &mut WebSocket<S>) {
-        if socket.queued() >= LOW_WATER {
-            return;
-        }
         let mut state = self.state.lock();
-        while socket.queued() < LOW_WATER {
+        let low_water = state.out.low_water();
+        while socket.queued() < low_water {
             let Some(frame) = state.out.next(now()) else {
                 return;
             };
@@ -309,6 +332,15 @@ impl<O: Order> Session<O> {
     }
 }
 
+/// Says that the session is not carried any more, once it is dropped.
+struct Down<'a>(&'a watch::Sender<bool>);
+
+impl Drop for Down<'_> {
+    fn drop(&mut self) {
+        self.0.send_replace(false);
+    }
+}
+
 enum Event {
     Message(Result<Message, WsError>),
     Woken,
@@ -318,6 +350,7 @@ enum Event {
 
 /// What belongs to one connection.
 struct Connection {
+    begun: Instant,
     heard: Instant,
     pinged: Instant,
     pongs: u32,
@@ -330,6 +363,7 @@ struct Connection {
 impl Connection {
     fn new() -> Self {
         Self {
+            begun: Instant::now(),
             heard: Instant::now(),
             pinged: Instant::now(),
             pongs: 0,

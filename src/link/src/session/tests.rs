@@ -9,6 +9,9 @@ use super::*;
 use crate::frame::Frame;
 use crate::{MAX_FRAME, MAX_RECORD};
 
+mod ends;
+mod lanes;
+
 /// Either end: which orders it gives does not matter here.
 type Session = RobotSession;
 

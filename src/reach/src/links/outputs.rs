@@ -167,8 +167,9 @@ impl Outputs {
                     };
                     // Other nodes of the servant have links of their own.
                     if own.has(&message.publisher, |node| hub.is_of(&reader, node)) {
+                        let quality = Quality::of(&message.wire_type.name, message.latching);
                         let bytes = reader.shift(&hub, Direction::Out, &stamps, message.bytes);
-                        reader.send(channel, bytes, message.latching);
+                        reader.send(channel, bytes, message.latching, quality);
                     }
                 }
             };
@@ -278,7 +279,7 @@ impl Hub {
 }
 
 impl NodeLink {
-    fn send(&self, channel: u32, message: Bytes, latching: bool) {
+    fn send(&self, channel: u32, message: Bytes, latching: bool, quality: Quality) {
         let born = now();
         let data = Data {
             channel,
@@ -289,11 +290,6 @@ impl NodeLink {
             serialise: 0,
             answered: self.outputs.given.lock().answered_by(mark(&message), born),
             message,
-        };
-        let quality = if latching {
-            Quality::Each
-        } else {
-            Quality::Newest
         };
         self.session.publish(data, quality);
     }

@@ -5,6 +5,7 @@ use ros::ros1::master::{Master, MasterOptions};
 use tokio::io::{DuplexStream, duplex};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 
 use super::*;
 use link::control::{Exit, FromRobot, Input, Node, Resume};
@@ -103,16 +104,25 @@ fn hello(node: &str, attempt: u64) -> Hello {
 
 /// Says hello on a new connection; how that is answered.
 async fn says(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
+    let (socket, welcome, _) = is_served(hub, hello).await;
+    (socket, welcome)
+}
+
+/// The same, and what serves the connection.
+async fn is_served(
+    hub: &Arc<Hub>,
+    hello: &Hello,
+) -> (WebSocket<DuplexStream>, Welcome, JoinHandle<Lost>) {
     let (robot, cloud) = duplex(1 << 16);
     let hub = Arc::clone(hub);
-    tokio::spawn(async move { hub.serve(cloud, b"").await });
+    let serving = tokio::spawn(async move { hub.serve(cloud, b"").await });
     let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
     let mut held = Budget::unlimited().permit();
     let welcome = receive_open(&mut socket, "welcome", &mut held)
         .await
         .unwrap();
-    (socket, welcome)
+    (socket, welcome, serving)
 }
 
 fn resuming(attempt: u64, welcome: &Welcome) -> Hello {
@@ -346,6 +356,40 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let resumed = says(&hub, &back);
     let (_, welcome) = timeout(PATIENCE, resumed).await.expect("others hold it up");
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
+}
+
+#[tokio::test]
+async fn a_link_whose_connection_is_dropped_ends_with_its_node() {
+    let options = HubOptions {
+        grace: Duration::ZERO,
+        ..HubOptions::default()
+    };
+    let (hub, nodes) = hub_with(options).await;
+    let (_socket, _, serving) = is_served(&hub, &hello("/detect", 1)).await;
+    let link = hub.links.lock()["/detect"].clone();
+    let (mut up, mut signals) = (link.session.up(), nodes.signals.subscribe());
+    let is_up = timeout(PATIENCE, up.wait_for(|up| *up)).await;
+    drop(is_up.expect("it is carried").unwrap());
+    // As where its robot may not be here any more.
+    serving.abort();
+    let is_down = timeout(PATIENCE, up.wait_for(|up| !*up)).await;
+    drop(is_down.expect("nothing carries it").unwrap());
+    let told = signals.wait_for(|signals| signals.contains(&("/detect".into(), 2)));
+    let told = timeout(PATIENCE, told).await;
+    told.expect("the node is ended").unwrap();
+}
+
+#[tokio::test]
+async fn robots_are_told_why_their_links_are_closed() {
+    let (hub, _nodes) = hub().await;
+    let (socket, _) = says(&hub, &hello("/detect", 1)).await;
+    let link = hub.links.lock()["/detect"].clone();
+    let mut up = link.session.up();
+    let is_up = timeout(PATIENCE, up.wait_for(|up| *up)).await;
+    drop(is_up.expect("it is carried").unwrap());
+    hub.close("the service was taken back");
+    let reason = timeout(PATIENCE, closed(socket)).await;
+    assert_eq!(reason.expect("it is closed"), "the service was taken back");
 }
 
 #[tokio::test]

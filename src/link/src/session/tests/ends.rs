@@ -1,0 +1,66 @@
+//! How connections and sessions end where the other end takes no part in it.
+
+use super::*;
+
+/// More than a socket holds that nobody reads.
+const MUCH: usize = 4 << 20;
+
+#[tokio::test]
+async fn a_session_whose_connection_is_dropped_is_down() {
+    let (robot, cloud) = (session(), session());
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    let nobody = To(mpsc::unbounded_channel().0);
+    let mut up = robot.up();
+    tokio::select! {
+        lost = robot.run(&mut at_robot, &nobody) => panic!("{lost}"),
+        lost = cloud.run(&mut at_cloud, &nobody) => panic!("{lost}"),
+        // What is borrowed of it must not live when the others are dropped.
+        () = async { drop(up.wait_for(|up| *up).await.unwrap()) } => {}
+    }
+    assert!(!robot.is_up() && !cloud.is_up());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_session_ends_although_the_other_end_takes_nothing_any_more() {
+    let (robot, cloud) = (session(), session());
+    open(&robot, &cloud);
+    let (mut at_robot, _at_cloud) = sockets();
+    let nobody = To(mpsc::unbounded_channel().0);
+    robot.answer(1, 0, Ok(vec![0; MUCH].into()));
+    let begun = Instant::now();
+    let (lost, ()) = tokio::join!(robot.run(&mut at_robot, &nobody), async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        robot.end(1000, "the node has ended");
+    });
+    assert!(matches!(lost, Lost::Ended), "{lost}");
+    assert!(
+        begun.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        begun.elapsed()
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_close_is_heard_though_whoever_sent_it_reads_nothing_any_more() {
+    let (robot, cloud) = (session(), session());
+    open(&robot, &cloud);
+    let (mut at_robot, mut at_cloud) = sockets();
+    let nobody = To(mpsc::unbounded_channel().0);
+    robot.answer(1, 0, Ok(vec![0; MUCH].into()));
+    let begun = Instant::now();
+    let (lost, ()) = tokio::join!(robot.run(&mut at_robot, &nobody), async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        at_cloud.queue_close(1012, "the service moves");
+        poll_fn(|cx| at_cloud.poll_flush(cx)).await.unwrap();
+    });
+    let Lost::Closed { code: 1012, reason } = lost else {
+        panic!("{lost}");
+    };
+    assert_eq!(reason, "the service moves");
+    assert!(
+        begun.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        begun.elapsed()
+    );
+}
