@@ -22,12 +22,40 @@ struct Scene {
     _robot: WebSocket<DuplexStream>,
 }
 
+async fn master() -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let master = Master::new(MasterOptions::default());
+    tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+    address
+}
+
+/// What a Master says to this.
+async fn asks(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
+    let parameters = parameters.iter();
+    let parameters: String = parameters
+        .map(|text| format!("<param><value>{text}</value></param>"))
+        .collect();
+    let call = format!(
+        "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{parameters}</params></methodCall>"
+    );
+    let mut stream = TcpStream::connect(master).await.unwrap();
+    let length = call.len();
+    let head = format!(
+        "POST / HTTP/1.1\r\nHost: here\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n"
+    );
+    let request = [head, call].concat();
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = Vec::new();
+    while !String::from_utf8_lossy(&answer).contains("</methodResponse>") {
+        assert!(stream.read_buf(&mut answer).await.unwrap() > 0, "{method}");
+    }
+    String::from_utf8(answer).unwrap()
+}
+
 impl Scene {
     async fn new() -> Self {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
-        let master = Master::new(MasterOptions::default());
-        tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        let address = master().await;
         let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
         let (bus, node) = (
             join("/bridge").await.unwrap(),
@@ -56,37 +84,14 @@ impl Scene {
         link::Handler::record(&*self.link(), record, held, 0);
     }
 
-    /// What the Master says to this.
-    async fn asks(&self, method: &str, parameters: &[&str]) -> String {
-        let parameters = parameters.iter();
-        let parameters: String = parameters
-            .map(|text| format!("<param><value>{text}</value></param>"))
-            .collect();
-        let call = format!(
-            "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{parameters}</params></methodCall>"
-        );
-        let mut stream = TcpStream::connect(self.master).await.unwrap();
-        let length = call.len();
-        let head = format!(
-            "POST / HTTP/1.1\r\nHost: here\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n"
-        );
-        let request = [head, call].concat();
-        stream.write_all(request.as_bytes()).await.unwrap();
-        let mut answer = Vec::new();
-        while !String::from_utf8_lossy(&answer).contains("</methodResponse>") {
-            assert!(stream.read_buf(&mut answer).await.unwrap() > 0, "{method}");
-        }
-        String::from_utf8(answer).unwrap()
-    }
-
     /// Has the Master say that the node serves this there.
     async fn serves(&self, service: &str, at: SocketAddr) {
-        let found = self.asks("lookupNode", &["/test", "/detect"]).await;
+        let found = asks(self.master, "lookupNode", &["/test", "/detect"]).await;
         let begin = found.find("http://").expect("its address");
         let node = found[begin..].split('<').next().unwrap();
         let at = format!("rosrpc://{at}");
         let registered = ["/detect", service, &at, node];
-        let registered = self.asks("registerService", &registered).await;
+        let registered = asks(self.master, "registerService", &registered).await;
         assert!(registered.contains(">1<"), "{registered}");
     }
 
@@ -117,10 +122,9 @@ async fn a_service_that_hangs_keeps_no_other_waiting() {
     let scene = Scene::new().await;
     let hangs = TcpListener::bind("127.0.0.1:0").await.unwrap();
     scene.serves("/a", hangs.local_addr().unwrap()).await;
-    let given_up = async {
-        let (mut asked, _) = hangs.accept().await.unwrap();
-        while asked.read_buf(&mut Vec::new()).await.unwrap_or(0) > 0 {}
-    };
+    let asked = timeout(PATIENCE, hangs.accept()).await;
+    let (mut asked, _) = asked.expect("it is asked").unwrap();
+    let given_up = async { while asked.read_buf(&mut Vec::new()).await.unwrap_or(0) > 0 {} };
     let serving = scene.node.serve("/b", of_echo(), Arc::new(Echo));
     let _serving = serving.await.unwrap();
     tokio::select! {
@@ -132,14 +136,20 @@ async fn a_service_that_hangs_keeps_no_other_waiting() {
 #[tokio::test]
 async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
     let scene = Scene::new().await;
-    let elsewhere = Ros1Bus::connect(Arc::new(HostSockets), scene.master, "/elsewhere");
+    // At another Master, where nobody else is registered for it.
+    let other = master().await;
+    let elsewhere = Ros1Bus::connect(Arc::new(HostSockets), other, "/elsewhere");
     let elsewhere = elsewhere.await.unwrap();
     let serving = elsewhere.serve("/a", of_echo(), Arc::new(Echo));
     let _serving = serving.await.unwrap();
-    let found = scene.asks("lookupService", &["/test", "/a"]).await;
-    let begin = found.find("rosrpc://").expect("its address") + "rosrpc://".len();
-    let real = found[begin..].split(['<', '/']).next().unwrap().to_owned();
-    // From now on it is the node's, behind something that refuses at first.
+    let found = asks(other, "lookupService", &["/test", "/a"]).await;
+    let begin = found.rfind("rosrpc://").expect("its address") + "rosrpc://".len();
+    let real = found[begin..]
+        .split(['<', '/', ']'])
+        .next()
+        .unwrap()
+        .to_owned();
+    // Here it is the node's, behind something that refuses at first.
     let before = TcpListener::bind("127.0.0.1:0").await.unwrap();
     scene.serves("/a", before.local_addr().unwrap()).await;
     let answers = async {
