@@ -267,6 +267,7 @@ fn main() -> ExitCode {
             frames_that_stay_away_stop_the_robot_and_wake_its_original,
             outputs_that_become_too_old_wake_the_original,
             a_first_sign_has_the_original_ready_before_it_is_needed,
+            a_camera_faster_than_its_node_stops_nobody,
             explain_says_why,
         ],
         of_both![fallback:

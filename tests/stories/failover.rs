@@ -438,6 +438,56 @@ pub fn a_first_sign_has_the_original_ready_before_it_is_needed(ros: RosVersion) 
     Ok(())
 }
 
+/// Pictures of the story of a fast camera, and the time between two: 30 a second.
+const FAST: (u32, Duration) = (150, Duration::from_nanos(33_333_333));
+
+pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
+    const SIZE: (u32, u32) = (640, 480);
+    let more = format!(
+        "local = \"none\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\n\
+         safe_stop = {{ topic = \"/cmd_vel\", type = \"geometry_msgs/Twist\" }}"
+    );
+    let mut scene = Scene::new(ros, "failover-camera", &more)?;
+    let wheels = scene.site.joins("/wheels")?;
+    let mut commands = scene.site.hears(&wheels, "/cmd_vel")?;
+    let number = scene.asks();
+    scene.hears(number)?;
+    // A picture takes it much longer than the time to the next one.
+    let servant = scene
+        .daemon
+        .servant_of(people::service(ros).name, &scene.robot)?;
+    let id = servant["id"].as_str().context("an id")?;
+    let less = ["set", id, "--cpus", "0.3"];
+    scene.daemon.deployer().types(&less)?.succeeded()?;
+    let pixels = vec![0; (SIZE.0 * SIZE.1 * 3) as usize];
+    let (pictures, pause) = FAST;
+    let mut next = Instant::now();
+    for _ in 0..pictures {
+        scene.sent += 1;
+        let picture = picture_of(ros, scene.sent, SIZE, &pixels);
+        scene.camera.image.publish(picture);
+        next += pause;
+        while let Some(left) = next
+            .checked_duration_since(Instant::now())
+            .filter(|left| !left.is_zero())
+        {
+            if let Some(answer) = scene.site.next_within(&mut scene.camera.found, left)? {
+                scene.notes(&answer)?;
+            }
+        }
+    }
+    // The newest is never left out.
+    scene.hears(scene.sent)?;
+    let answered = scene.answers.len();
+    ensure!(
+        answered < pictures as usize / 2,
+        "it answers {answered} of {pictures}: no story of a slow node"
+    );
+    let stopped = scene.site.next_within(&mut commands, MOMENT)?;
+    ensure!(stopped.is_none(), "{stopped:?}\n{}", scene.stub.said());
+    scene.explains_link("late", 0.0)
+}
+
 pub fn explain_says_why(ros: RosVersion) -> Verdict {
     let service = people::service(ros).name;
     let more = format!("local = \"none\"\ndesire = 0.001\nmax = {T_MAX:?}");

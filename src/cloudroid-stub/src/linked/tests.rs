@@ -49,6 +49,7 @@ async fn welcomes(listener: &TcpListener) -> (Option<String>, WebSocket<TcpStrea
         next: 1,
         codecs: Vec::new(),
         servant: "servant".to_owned(),
+        limits: link::Limits::default(),
     };
     send_open(&mut socket, &welcome).await.unwrap();
     (hello.resume.map(|resume| resume.session), socket)

@@ -439,7 +439,7 @@ async fn a_new_session_is_seen_while_something_still_answers_by_the_old_one() {
     let sla = Sla::parse(sla).unwrap();
     let setting = setting(&scene.robot, &[]);
     let mirror = &scene.mirror;
-    let promised = mirror.promise(sla, setting, diagnostics.unwrap(), &watcher);
+    let promised = mirror.promise(sla, setting, Vec::new(), diagnostics.unwrap(), &watcher);
     promised.await.unwrap();
     let keeper = mirror.keeper().unwrap();
     let sees = async |is_up: bool| {

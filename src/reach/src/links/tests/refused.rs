@@ -143,8 +143,12 @@ async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
     let serving = elsewhere.serve("/a", of_echo(), Arc::new(Echo));
     let _serving = serving.await.unwrap();
     let found = asks(other, "lookupService", &["/test", "/a"]).await;
-    let begin = found.find("rosrpc://").expect("its address") + "rosrpc://".len();
-    let real = found[begin..].split(['<', '/']).next().unwrap().to_owned();
+    let begin = found.rfind("rosrpc://").expect("its address") + "rosrpc://".len();
+    let real = found[begin..]
+        .split(['<', '/', ']'])
+        .next()
+        .unwrap()
+        .to_owned();
     // Here it is the node's, behind something that refuses at first.
     let before = TcpListener::bind("127.0.0.1:0").await.unwrap();
     scene.serves("/a", before.local_addr().unwrap()).await;
