@@ -168,7 +168,7 @@ impl Pusher {
         let build = self.home.join("build").join(id);
         let mut left = Left::new(&self.options, build, &self.disks);
         let made = left
-            .during(self.made(id, options, archive, (by, report)))
+            .during(Box::pin(self.made(id, options, archive, (by, report))))
             .await?;
         let (built, imported) = match made {
             Made::Built(built) => (*built, None),
@@ -199,14 +199,15 @@ impl Pusher {
             plan.restart = record.plan.restart;
         }
         let layers: Vec<_> = built.layers.iter().map(layer).collect();
-        let shown = self.shown(id, options, (built, plan), (name.clone(), by), report);
+        // Together they take more than a thread's stack has in a build that is not optimised.
+        let shown = Box::pin(self.shown(id, options, (built, plan), (name.clone(), by), report));
         let (record, inventory) = left.during(shown).await?;
         // The token may have been revoked meanwhile.
         by.may(&name)?;
         // From here on nothing breaks it off: what was published is not told to have been cancelled.
         report.publishing.cancel();
         let terms = options.rollout;
-        self.publish(record, inventory, terms, report).await?;
+        Box::pin(self.publish(record, inventory, terms, report)).await?;
         if let Some((record, _)) = &imported {
             self.take_over_rows(&name, record, report);
         }
@@ -274,7 +275,8 @@ impl Pusher {
         for warning in self.choreographer.check_grants(&plan.grants)? {
             report.warning(warning).await;
         }
-        let found = probe::interface(self, id, &built, &mut plan, options, report).await?;
+        let found = probe::interface(self, id, &built, &mut plan, options, report);
+        let found = Box::pin(found).await?;
         for warning in found.warnings {
             report.warning(warning).await;
         }

@@ -177,7 +177,8 @@ impl Pusher {
         cancel: CancellationToken,
     ) -> Result<Published, Error> {
         let id = format!("push-{}", names::random(8));
-        let work = blocking::cancellable(self.push(&id, options, by, archive, report));
+        let push = Box::pin(self.push(&id, options, by, archive, report));
+        let work = blocking::cancellable(push);
         let over = async {
             tokio::select! {
                 () = cancel.cancelled() => Error::Ending,
