@@ -457,7 +457,11 @@ pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
         .daemon
         .servant_of(people::service(ros).name, &scene.robot)?;
     let id = servant["id"].as_str().context("an id")?;
-    let less = ["set", id, "--cpus", "0.3"];
+    let cores = match ros {
+        RosVersion::One => "0.3",
+        RosVersion::Two => "0.1",
+    };
+    let less = ["set", id, "--cpus", cores];
     scene.daemon.deployer().types(&less)?.succeeded()?;
     let pixels = vec![0; (SIZE.0 * SIZE.1 * 3) as usize];
     let (pictures, pause) = FAST;
