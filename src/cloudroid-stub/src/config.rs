@@ -33,7 +33,7 @@
 //! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed,
 //!                      # "first-sign" started by the first late request and fed when needed, "none"
 //! stateful = false     # the local original takes over only while the link is down
-//! safe_stop = "/cmd_vel"   # an output on which a message of zeros is published when neither side answers in time, or
+//! safe_stop = "/cmd_vel"   # experimental: an output on which a message of zeros is published when neither side answers in time, or
 //! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
 //! # The name that an executable's node has when none is given, where that is not the executable's; in ROS 2 with a namespace
 //! # ("/camera/listener") where the program gives it one.
