@@ -219,7 +219,7 @@ pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> V
         &overlay,
         original.0,
         original.1,
-        &["__name:=move_base"],
+        &["__name:=move_base", "_keeps_scanning:=true"],
     )?;
     let base = Base::new(&site)?;
     base.is_driven(&stub)?;

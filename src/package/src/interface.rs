@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::de::IgnoredAny;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::requests::Request;
 
@@ -36,11 +37,30 @@ pub struct Interface {
     pub lifecycle: Vec<String>,
     /// Which inputs are answered by which outputs, as the push has decided; none in what was recorded before pushes did
     /// ([`Interface::decided_requests`]).
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "read_requests"
+    )]
     pub requests: Option<Vec<Request>>,
     /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`:
     /// those used above and all they refer to.
     pub definitions: BTreeMap<String, String>,
+}
+
+/// Reads decided requests. Where one of them cannot be read there are none, and they are decided anew.
+fn read_requests<'de, D: Deserializer<'de>>(from: D) -> Result<Option<Vec<Request>>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Written {
+        Request(Request),
+        Unreadable(IgnoredAny),
+    }
+    let written = Option::<Vec<Written>>::deserialize(from)?;
+    let read = |one| match one {
+        Written::Request(request) => Some(request),
+        Written::Unreadable(_) => None,
+    };
+    Ok(written.and_then(|all| all.into_iter().map(read).collect()))
 }
 
 /// From the package's point of view.

@@ -335,7 +335,11 @@ impl<P: Clone> Arbiter<P> {
                 .requests
                 .iter()
                 .filter(|(_, record)| !record.has_caller());
-            let oldest: Vec<RequestId> = inputs.map(|(id, _)| *id).take(crowd).collect();
+            // Goals take as long as they take: they go last.
+            let (inputs, goals): (Vec<_>, Vec<_>) =
+                inputs.partition(|(_, record)| matches!(record.kind, Kind::Input(_)));
+            let oldest = inputs.iter().chain(&goals).map(|(id, _)| **id).take(crowd);
+            let oldest: Vec<RequestId> = oldest.collect();
             for id in oldest {
                 forgotten.extend(self.remove(id).map(|record| (id, record)));
             }

@@ -43,6 +43,12 @@ impl Correlation {
 }
 
 impl Pair {
+    /// Whether a pair can be written and read with this name: an absolute one of letters, digits, `_` and `/`.
+    pub fn can_name(topic: &str) -> bool {
+        let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '/';
+        topic.len() > 1 && topic.starts_with('/') && topic.chars().all(plain)
+    }
+
     /// The same with other names of topics.
     pub fn renamed(&self, name: impl Fn(&str) -> String) -> Self {
         Self {
@@ -98,8 +104,7 @@ impl FromStr for Pair {
         };
         let topic = |name: &str| {
             let name = name.trim();
-            let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '/';
-            if name.len() > 1 && name.starts_with('/') && name.chars().all(plain) {
+            if Self::can_name(name) {
                 Ok(name.to_owned())
             } else {
                 Err(refuse(&format!(

@@ -400,6 +400,20 @@ fn who_takes_every_picture_and_falls_silent_is_stopped_for_at_t_max() {
 }
 
 #[test]
+fn who_answers_everything_too_late_stops_the_robot() {
+    for takes in [10, 64] {
+        let mut world = World::with_pairs("none", "stamp");
+        (world.delay, world.nodes[0].takes) = (225, takes);
+        world.passes(10_000);
+        let counts = world.counts();
+        assert!(
+            counts.safe_stops > 100 && counts.unanswered_in_time > 100,
+            "{takes} ms: {counts:?}"
+        );
+    }
+}
+
+#[test]
 fn a_node_that_becomes_slow_is_late_once_at_most() {
     for takes in [40, 64, 100, 130] {
         let mut world = World::with_pairs("none", "stamp");

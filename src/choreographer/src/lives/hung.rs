@@ -61,7 +61,9 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                 if let Some(hung) = hung {
                     let tidings = act(&inner, &handle, &key.1, hung);
                     if let Some(killed) = tidings.kills {
-                        kills.begin(&handle.id, kill(Arc::clone(&handle), killed));
+                        // Several nodes of a servant may hang at once.
+                        let visit = format!("{} {}", handle.id, key.1);
+                        kills.begin(&visit, kill(Arc::clone(&handle), killed));
                     }
                     words = Some(tidings.words);
                 }

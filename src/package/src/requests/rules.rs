@@ -165,8 +165,11 @@ fn pair(trigger: &End, mut answers: Vec<&End>, by: Correlation) -> Option<Pair> 
     })
 }
 
+/// Whether a topic is no request and no answer, whatever else there is. Nodes may call topics as no ROS allows; what is decided could not be
+/// read again with such a name.
 fn is_housekeeping(end: &End) -> bool {
-    HOUSEKEEPING.contains(&end.name.as_str())
+    !Pair::can_name(&end.name)
+        || HOUSEKEEPING.contains(&end.name.as_str())
         || HOUSEKEEPING_ENDINGS
             .iter()
             .any(|ending| end.name.ends_with(ending))

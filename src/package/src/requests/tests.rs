@@ -392,6 +392,21 @@ fn what_was_recorded_before_has_its_requests_decided_now() {
 }
 
 #[test]
+fn what_could_not_be_read_again_is_not_decided() {
+    let odd = [
+        "</camera-1/image sensor_msgs/Image",
+        ">/out std_msgs/String",
+        ">/o,ut std_msgs/String",
+    ];
+    assert_eq!(decided(&odd, &[]), [""; 0]);
+    // Whatever a record has, the rest of it is read.
+    let unreadable =
+        r#"{"requests": [{"pair": "/camera-1/image -> /out", "reason": "alone"}], "topics": []}"#;
+    let read: Interface = serde_json::from_str(unreadable).unwrap();
+    assert_eq!(read.requests, None);
+}
+
+#[test]
 fn the_words_name_the_option() {
     let request = |reason| Request {
         node: "/node".to_owned(),

@@ -52,12 +52,12 @@ impl Stream {
     }
 
     /// Until when an input whose T_max has passed may turn out to have been left out. What was given to a busy node is waited for
-    /// until T_max after that was heard last.
+    /// until T_max after that was heard last, and T_max more than its own at most.
     pub(super) fn may_be_left_out<P>(&self, id: RequestId, record: &Record<P>) -> Option<Instant> {
         let t_max = record.deadline - record.asked_at;
         let passed_over = |queue: &Queue| queue.passed_over(id, record.asked_at);
         let heard = self.queues.iter().filter_map(passed_over).max();
-        heard.map(|heard| heard + t_max)
+        heard.map(|heard| heard.min(record.deadline) + t_max)
     }
 }
 
@@ -71,11 +71,15 @@ impl<P: Clone> Governor<P> {
 
     /// A side has answered an input: it has left out those that it was given before.
     pub(super) fn has_passed(&mut self, now: Instant, side: Side, id: RequestId) {
-        let Some(Kind::Input(pair)) = self.arbiter.get(id).map(|record| record.kind) else {
+        let record = self.arbiter.get(id);
+        let Some((Kind::Input(pair), deadline)) = record.map(|it| (it.kind, it.deadline)) else {
             return;
         };
         let stream = &mut self.pairs[pair];
-        stream.passed = stream.passed.max(Some(id));
+        // An answer that is late itself excuses nothing.
+        if now <= deadline {
+            stream.passed = stream.passed.max(Some(id));
+        }
         let queue = &mut stream.queues[side.index()];
         let mut left_out = false;
         for earlier in queue.answered(now, id) {

@@ -28,7 +28,13 @@ while not located.wait(0.2):
     rospy.logwarn_throttle(1.0, "waiting for the transform from %s to map" % base)
 rospy.wait_for_service("/static_map")
 rospy.ServiceProxy("/static_map", Trigger)()
-rospy.wait_for_message("/scan", LaserScan)
+# By a subscription that ends with the first one, unless it is to stay.
+scanned = threading.Event()
+if rospy.get_param("~keeps_scanning", False):
+    scans = rospy.Subscriber("/scan", LaserScan, lambda _: scanned.set())
+    scanned.wait()
+else:
+    rospy.wait_for_message("/scan", LaserScan)
 # Goals of its own, beside the server's input of the same name.
 own = rospy.Publisher("~goal", TestActionGoal, queue_size=1)
 
