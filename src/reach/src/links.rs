@@ -300,15 +300,17 @@ impl Hub {
                 (None, Ok(())) => return replaced_by_another(),
             }
         };
-        carrying.is_ended = matches!(
+        let is_over = matches!(
             lost,
             Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full(_)
         );
         if matches!(lost, Lost::Closed { code: 1000, .. }) {
             self.attempts.ended(&hello.run);
         }
-        if carrying.is_ended {
+        if is_over {
             self.end(&link, turn).await;
+            // Whoever drops this meanwhile has the link expire all the same.
+            carrying.is_ended = true;
         }
         lost
     }

@@ -11,6 +11,19 @@ mod ahead;
 mod hung;
 mod rollouts;
 
+/// A request for a servant of greet by this robot, which states this.
+pub(super) fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
+    let stated = api::Stated::read(query.iter().copied()).expect("valid");
+    ServantRequest::new("greet", robot).stating(stated)
+}
+
+/// A lease of a servant that is ready.
+pub(super) async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
+    let lease = daemon.ensure(request).expect("a lease");
+    lease.ready().await.expect("ready");
+    lease
+}
+
 /// A machine, and what outlives a daemon on it.
 pub(super) struct World {
     home: tempfile::TempDir,

@@ -2,24 +2,13 @@
 
 use servant::engine::Servant as _;
 
-use super::servants::World;
+use super::servants::{World, ready, stating};
 use super::*;
 use crate::options::Hung;
 
 const SECOND: Duration = Duration::from_secs(1);
 /// Of each kind: in whatever order they are looked at, one that is stuck comes before one that is not.
 const EACH: usize = 4;
-
-fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
-    let stated = api::Stated::read(query.iter().copied()).expect("valid");
-    ServantRequest::new("greet", robot).stating(stated)
-}
-
-async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
-    let lease = daemon.ensure(request).expect("a lease");
-    lease.ready().await.expect("ready");
-    lease
-}
 
 fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
     world.engine.servant(&lease.handle().id).expect("it runs")

@@ -1,18 +1,7 @@
 //! What robots state, and what their servants get for it, told with the engine in memory.
 
-use super::servants::World;
+use super::servants::{World, ready, stating};
 use super::*;
-
-fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
-    let stated = api::Stated::read(query.iter().copied()).expect("valid");
-    ServantRequest::new("greet", robot).stating(stated)
-}
-
-async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
-    let lease = daemon.ensure(request).expect("a lease");
-    lease.ready().await.expect("ready");
-    lease
-}
 
 /// Cores and memory that are in force.
 async fn enforced(daemon: &Choreographer, lease: &Lease) -> (Option<f64>, Option<api::Size>) {

@@ -33,7 +33,11 @@ impl Request {
         let remaps = Remaps::of(robot.ros, &robot.argv, &robot.node);
         let is_of_it = |of: &&Answered| of.program.as_deref().is_none_or(|of| of == executable);
         let request = |of: &Answered| {
-            let pair: Pair = of.request.parse().ok()?;
+            let pair = of.request.parse::<Pair>();
+            let pair = pair.inspect_err(|error| {
+                tracing::warn!("revision.toml: {error}; this request is not judged");
+            });
+            let pair = pair.ok()?;
             let names = |name: &String| names(name, &of.node, &robot.node, &remaps);
             Some(Self {
                 input: names(&pair.input),

@@ -427,7 +427,11 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
                 };
                 let turns = (Arc::clone(&turns), turn);
                 let (channel, link, hub) = (input.channel, Arc::clone(&link), Arc::clone(&hub));
-                let open = async move { link.inputs.open(&hub, &link.drops, input, turns).await };
+                // One that is refused is tried again for as long as its channel is open, and is its robot's to pay for so long.
+                let open = async move {
+                    let _held = _held;
+                    link.inputs.open(&hub, &link.drops, input, turns).await;
+                };
                 opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
             }
             FromRobot::Close { channel } => {

@@ -1,11 +1,13 @@
 //! Inputs that may be asked for again: until they are answered, or late, the other side may still be given them. With a long T_max that is
-//! many pictures, so what they take is bounded, and the oldest give way.
+//! many pictures, so what they take is bounded, and the oldest give way. Goals of ROS 1 are small, few and open for as long as they take:
+//! they do not give way to pictures.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 use ros::bus::Message;
+use ros::ros1::actions;
 
 /// Bytes of the messages of one node.
 const MOST: usize = 64 << 20;
@@ -54,11 +56,15 @@ impl KeptInputs {
     /// Keeps one more, whatever its size.
     pub(super) fn keep(&mut self, message: Message) -> Arc<KeptInput> {
         let bytes = message.bytes.len();
+        let is_goal = actions::carries_goal_id(&message.wire_type.name);
         let input = Arc::new(KeptInput {
             is_latched: message.latching,
             bytes,
             message: Mutex::new(Some(message)),
         });
+        if is_goal {
+            return input;
+        }
         if self.bytes + bytes > self.most || self.inputs.len() > 2 * self.held + FEW {
             self.forget_unheld();
         }
@@ -102,6 +108,19 @@ mod tests {
             publisher: "/camera".into(),
             latching: false,
         }
+    }
+
+    #[test]
+    fn goals_do_not_give_way_to_pictures() {
+        let mut kept = KeptInputs {
+            most: 100,
+            ..KeptInputs::default()
+        };
+        let mut goal = message(30);
+        goal.wire_type = Arc::new(WireType::named("move_base_msgs/MoveBaseActionGoal"));
+        let goal = kept.keep(goal);
+        let pictures: Vec<_> = (0..9).map(|_| kept.keep(message(30))).collect();
+        assert!(goal.message().is_some() && pictures[0].message().is_none());
     }
 
     #[test]

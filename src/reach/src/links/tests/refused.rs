@@ -80,7 +80,10 @@ impl Scene {
     }
 
     fn tells(&self, record: Record<FromRobot>) {
-        let held = Budget::unlimited().permit();
+        self.tells_at_cost(record, Budget::unlimited().permit());
+    }
+
+    fn tells_at_cost(&self, record: Record<FromRobot>, held: budget::Permit) {
         link::Handler::record(&*self.link(), record, held, 0);
     }
 
@@ -226,4 +229,41 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
     says(2);
     let message = timeout(PATIENCE, heard.messages.recv()).await.unwrap();
     assert_eq!(message.unwrap().bytes, [2_u8][..]);
+}
+
+#[tokio::test]
+async fn an_input_that_is_refused_counts_as_its_robots_until_its_channel_is_closed() {
+    let scene = Scene::new().await;
+    let other = WireType::new(
+        "std_msgs/String",
+        "992ce8a1687cec8c8bd883ec73ca41d1",
+        "string data",
+    );
+    let qos = Qos::keep_last(1);
+    let _other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
+    let told = Budget::new("what robot x tells", 1 << 20);
+    let open = Record::Control(FromRobot::Open(Input {
+        channel: 1,
+        topic: "/image".into(),
+        type_name: "std_msgs/UInt8".into(),
+        md5: "7c8164229e7d2c17eb95e9231617fdee".into(),
+        definition: "uint8 data".into(),
+        ..Input::default()
+    }));
+    scene.tells_at_cost(open, told.take(1000).unwrap());
+    // The next order is obeyed when it has been taken up.
+    let (parameters, obeyed) = (Vec::new(), told.take(10).unwrap());
+    scene.tells_at_cost(Record::Control(FromRobot::Parameters(parameters)), obeyed);
+    let used = async |bytes: usize| {
+        let used = async {
+            while told.used() != bytes {
+                tokio::task::yield_now().await;
+            }
+        };
+        let used = timeout(PATIENCE, used).await;
+        assert!(used.is_ok(), "{} of {bytes} bytes", told.used());
+    };
+    used(1000).await;
+    scene.tells(Record::Control(FromRobot::Close { channel: 1 }));
+    used(0).await;
 }
